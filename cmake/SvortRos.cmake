@@ -1,0 +1,30 @@
+# Messages, file formats, ROS layer and programs; everything that needs more than LibTorch and Eigen.
+
+find_package(catkin REQUIRED COMPONENTS
+  diagnostic_updater geometry_msgs message_generation nodelet pluginlib rosbag roscpp rosgraph_msgs sensor_msgs
+  std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
+find_package(OpenCV REQUIRED COMPONENTS core imgproc imgcodecs)
+find_package(VTK REQUIRED COMPONENTS CommonCore CommonDataModel FiltersCore)
+find_package(NIFTI REQUIRED)
+find_package(yaml-cpp REQUIRED)
+find_package(CLI11 REQUIRED)
+find_package(nlohmann_json REQUIRED)
+
+add_message_files(FILES Slice.msg SliceStatus.msg SlicePose.msg SequenceEstimate.msg Volume.msg)
+generate_messages(DEPENDENCIES geometry_msgs sensor_msgs std_msgs)
+
+catkin_package(
+  INCLUDE_DIRS include
+  LIBRARIES svort_geometry svort_acquisition svort_reconstruction svort_sequence svort_live svort_io svort_ros_layer
+  CATKIN_DEPENDS diagnostic_updater geometry_msgs message_runtime nodelet pluginlib rosbag roscpp rosgraph_msgs
+                 sensor_msgs std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
+
+svort_library(svort_io MODULE io
+  LINK svort_live NIFTI::niftiio yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json
+       opencv_core opencv_imgproc opencv_imgcodecs)
+
+svort_library(svort_ros_layer MODULE ros
+  LINK svort_live svort_io ${catkin_LIBRARIES} VTK::CommonCore VTK::CommonDataModel VTK::FiltersCore)
+target_include_directories(svort_ros_layer SYSTEM PUBLIC ${catkin_INCLUDE_DIRS} ${CATKIN_DEVEL_PREFIX}/include)
+add_dependencies(svort_ros_layer ${PROJECT_NAME}_generate_messages_cpp)
+list(APPEND SVORT_LIBRARIES svort_io svort_ros_layer)

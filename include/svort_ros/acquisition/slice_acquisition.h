@@ -1,0 +1,46 @@
+#pragma once
+
+#include <torch/types.h>
+
+#include <array>
+#include <cstdint>
+
+namespace svort {
+
+/// Optional binary masks; an undefined tensor means "everything".
+struct AcquisitionMasks {
+  torch::Tensor slices;  ///< n x 1 x h x w, bool
+  torch::Tensor volume;  ///< D x H x W, bool
+};
+
+/// Geometry shared by the acquisition operator and its adjoint. Works in voxels.
+struct AcquisitionGeometry {
+  torch::Tensor transforms;        ///< n x 3 x 4, trans_first, translation in voxels: slice coordinates -> volume
+  torch::Tensor psf;               ///< see gaussian_psf
+  double resolution_ratio = 1.0;   ///< slice pixel / voxel size
+};
+
+/// A = D B T of the paper (sec. 2): the slices that the scanner would see of `volume`, exact formulation.
+///
+/// Each pixel is the PSF-weighted mean of the volume (trilinear), normalised by the PSF weight that falls inside the
+/// volume (and its mask). Pixels outside the slice mask, or with no weight, are 0.
+///
+/// @param volume D x H x W, float32, CPU
+/// @param height, width  slice size in pixels
+/// @param weight if not null, receives the PSF weight inside the volume, n x 1 x h x w
+/// @return n x 1 x h x w
+/// @throws std::invalid_argument naming the argument if a shape, type or device does not fit
+torch::Tensor acquire_slices(const torch::Tensor& volume, const AcquisitionGeometry& geometry, int height, int width,
+                             const AcquisitionMasks& masks = {}, torch::Tensor* weight = nullptr);
+
+/// Adjoint of A: spreads the slices into a volume with the same taps.
+///
+/// @param slices   n x 1 x h x w, float32, CPU
+/// @param volume_shape D, H, W
+/// @param equalize divide each voxel by the weight it received (PSF reconstruction); otherwise the plain sum
+/// @return D x H x W
+torch::Tensor scatter_slices(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+                             const std::array<std::int64_t, 3>& volume_shape, bool equalize,
+                             const AcquisitionMasks& masks = {});
+
+}  // namespace svort

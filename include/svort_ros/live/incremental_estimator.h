@@ -1,0 +1,90 @@
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "svort_ros/geometry/image_grid.h"
+#include "svort_ros/geometry/pose.h"
+#include "svort_ros/sequence/slice_sequence.h"
+
+namespace svort {
+
+/// Where a slice's pose comes from.
+enum class PoseStatus {
+  nominal,  ///< the scanner's own prescription; the head is assumed not to have moved
+};
+const char* to_string(PoseStatus status);
+
+/// What is known about one slice at one revision.
+struct SliceEstimate {
+  SliceInfo info;
+  Pose T_brain_slice = Pose::Identity();    ///< slice coordinates into the brain frame, mm
+  Pose T_scanner_brain = Pose::Identity();  ///< head pose when this slice was acquired, mm
+  double weight = 1.;                       ///< estimated quality, 0 .. 1
+  /// Correlation of the slice with itself simulated from the volume, over its brain pixels. NaN until a volume was
+  /// estimated with the slice in it. The slice is part of that volume, so this is an upper bound.
+  double ncc = 0.;
+  PoseStatus status = PoseStatus::nominal;
+};
+
+/// One published state. All poses belong together; the volume may be from an earlier revision.
+struct Estimate {
+  std::string scan_id;
+  std::uint64_t revision = 0;           ///< counts every change of poses or volume, from 1
+  std::uint64_t frame_revision = 0;     ///< counts moves of the brain frame itself, from 0: the head did not move then
+  std::vector<SliceEstimate> slices;    ///< in acquisition order
+  std::size_t encoded = 0;              ///< slices that a network encoded for this revision
+  bool final = false;                   ///< set by finalise(), until the next slice
+};
+
+struct EstimatorOptions {
+  std::string method = "nominal";         ///< which implementation; see make_estimator
+  double volume_resolution_mm = 1.0;      ///< voxel size of the volume
+  double volume_size_mm = 128.0;          ///< edge of the cube that is reconstructed, centred on the brain frame
+  double recentre_mm = 10.0;              ///< the brain frame moves only when its centre is off by more than this
+  int cg_iterations = 0;                  ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
+  int final_cg_iterations = 8;            ///< the same, in finalise()
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v("method", method, "estimator: nominal (the scanner's own poses, no motion estimate)");
+    v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume, mm");
+    v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
+    v("recentre_mm", recentre_mm, "the brain frame moves only when the brain's centre is off by more than this, mm");
+    v("cg_iterations", cg_iterations, "conjugate-gradient steps per volume while slices arrive; 0: PSF reconstruction");
+    v("final_cg_iterations", final_cg_iterations, "conjugate-gradient steps of the final volume");
+  }
+};
+
+/// Turns a growing sequence of slices into poses and a volume. One thread calls it; it keeps no reference to the
+/// sequence between calls.
+class IncrementalEstimator {
+ public:
+  virtual ~IncrementalEstimator() = default;
+
+  /// Takes in the sequence's newest slice. Call once per kept slice, in arrival order: the poses depend on that order
+  /// and the slices alone, not on when update_volume() is called in between. Quick (no volume is computed).
+  virtual void add(const SliceSequence& sequence) = 0;
+
+  /// Estimates the volume (and each slice's ncc) from the current poses.
+  virtual void update_volume(const SliceSequence& sequence) = 0;
+
+  /// Brings poses and volume to their best state; called when the scan, or a pause in it, leaves the time.
+  virtual void finalise(const SliceSequence& sequence) = 0;
+
+  /// Forgets everything; revisions go on counting.
+  virtual void reset() = 0;
+
+  virtual const Estimate& estimate() const = 0;
+  /// Empty until the first update_volume().
+  virtual const Volume& volume() const = 0;
+  /// "cpu" or "cuda:0".
+  virtual std::string device() const = 0;
+};
+
+/// @throws std::invalid_argument naming the option if a value is out of range or the method is unknown
+std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options);
+
+}  // namespace svort
