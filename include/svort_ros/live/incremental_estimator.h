@@ -32,20 +32,20 @@ struct SliceEstimate {
 /// One published state. All poses belong together; the volume may be from an earlier revision.
 struct Estimate {
   std::string scan_id;
-  std::uint64_t revision = 0;           ///< counts every change of poses or volume, from 1
-  std::uint64_t frame_revision = 0;     ///< counts moves of the brain frame itself, from 0: the head did not move then
-  std::vector<SliceEstimate> slices;    ///< in acquisition order
-  std::size_t encoded = 0;              ///< slices that a network encoded for this revision
-  bool final = false;                   ///< set by finalise(), until the next slice
+  std::uint64_t revision = 0;         ///< counts every change of poses or volume, from 1
+  std::uint64_t frame_revision = 0;   ///< counts moves of the brain frame itself, from 0: the head did not move then
+  std::vector<SliceEstimate> slices;  ///< in acquisition order
+  std::size_t encoded = 0;            ///< slices that a network encoded for this revision
+  bool final = false;                 ///< set by finalise(), until the next slice
 };
 
 struct EstimatorOptions {
-  std::string method = "nominal";         ///< which implementation; see make_estimator
-  double volume_resolution_mm = 1.0;      ///< voxel size of the volume
-  double volume_size_mm = 128.0;          ///< edge of the cube that is reconstructed, centred on the brain frame
-  double recentre_mm = 10.0;              ///< the brain frame moves only when its centre is off by more than this
-  int cg_iterations = 0;                  ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
-  int final_cg_iterations = 8;            ///< the same, in finalise()
+  std::string method = "nominal";     ///< which implementation; see make_estimator
+  double volume_resolution_mm = 1.0;  ///< voxel size of the volume
+  double volume_size_mm = 128.0;      ///< edge of the cube that is reconstructed, centred on the brain frame
+  double recentre_mm = 10.0;          ///< the brain frame moves only when its centre is off by more than this
+  int cg_iterations = 0;              ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
+  int final_cg_iterations = 8;        ///< the same, in finalise()
 
   template <class Visitor>
   void visit(Visitor&& v) {

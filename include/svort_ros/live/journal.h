@@ -1,7 +1,7 @@
 #pragma once
 
 #include <cstdint>
-#include <filesystem>
+#include <limits>
 #include <string>
 #include <vector>
 
@@ -15,23 +15,28 @@ struct JournalEntry {
   SliceInfo info;
   ArrivalStatus status = ArrivalStatus::accepted;
   std::string reason;
-  std::size_t sequence_length = 0;   ///< kept slices after this arrival
-  std::uint64_t revision = 0;        ///< revision in which the slice's pose was published
-  double latency_ms = 0.;            ///< arrival to published pose (rejected: to the answer)
-  double volume_latency_ms = 0.;     ///< arrival to the volume that contains it; NaN if it was overtaken
-  std::size_t encoded = 0;
+  std::size_t sequence_length = 0;  ///< kept slices after this arrival
+  std::uint64_t revision = 0;       ///< revision in which the slice's pose was published; 0 if rejected
+  double latency_ms = 0.;           ///< arrival to published pose (rejected: to the answer)
+  /// Arrival to the first published volume that contains the slice; NaN if rejected or not there yet.
+  double volume_latency_ms = std::numeric_limits<double>::quiet_NaN();
+  std::size_t encoded = 0;  ///< slices that a network encoded for this revision
   std::string device;
-  Pose T_brain_slice = Pose::Identity();  ///< causal pose; NaN in the file if the slice was rejected
+  Pose T_brain_slice = Pose::Identity();  ///< causal pose, mm; meaningless if the slice was rejected
 };
 
-/// The record of a scan: every arrival with its answer and its causal pose.
+/// The record of a scan: every arrival with its answer and its causal pose, in arrival order.
 class Journal {
  public:
-  void add(const JournalEntry& entry) { entries_.push_back(entry); }
-  /// Writes the volume latency of all entries since the last call that have none yet.
+  /// @return the number of the entry, to refer to it later
+  std::size_t add(const JournalEntry& entry) {
+    entries_.push_back(entry);
+    return entries_.size() - 1;
+  }
+  /// @throws std::out_of_range if there is no such entry
+  void set_volume_latency(std::size_t entry, double latency_ms) { entries_.at(entry).volume_latency_ms = latency_ms; }
   void clear() { entries_.clear(); }
   const std::vector<JournalEntry>& entries() const { return entries_; }
-  std::vector<JournalEntry>& entries() { return entries_; }
 
  private:
   std::vector<JournalEntry> entries_;
