@@ -1,0 +1,65 @@
+# shellcheck shell=bash
+# Shared by the scripts of this folder. Source it; it changes to the root of the project.
+
+set -euo pipefail
+ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)"
+cd "$ROOT"
+
+# catkin's code generators need Debian's interpreter; another python3 earlier on PATH lacks their modules. ROS's own
+# Python programs start with "env python3", so the order on PATH matters to them as well.
+PYTHON=/usr/bin/python3
+export PATH="/usr/bin:$PATH"
+
+say() { printf '== %s\n' "$*"; }
+fail() {
+  printf 'error: %s\n' "$*" >&2
+  exit 1
+}
+
+# A compiler process of LibTorch code takes up to 2 GiB.
+build_jobs() {
+  local cores memory_kib jobs
+  cores=$(nproc)
+  memory_kib=$(awk '/^MemAvailable:/ {print $2}' /proc/meminfo)
+  jobs=$((memory_kib / 2097152))
+  ((jobs >= 1)) || jobs=1
+  ((jobs <= cores)) || jobs=$cores
+  echo "$jobs"
+}
+
+# configure_and_build FOLDER [CMAKE_ARGUMENT...]
+configure_and_build() {
+  local folder=$1
+  shift
+  say "Configure $folder"
+  cmake -S . -B "$folder" -G Ninja -DPYTHON_EXECUTABLE=$PYTHON -DPython3_EXECUTABLE=$PYTHON "$@" >"$folder.log" 2>&1 || {
+    cat "$folder.log" >&2
+    fail "cmake failed; its output is above and in $folder.log"
+  }
+  mv "$folder.log" "$folder/configure.log"
+  say "Build $folder with $(build_jobs) jobs"
+  ninja -C "$folder" -j "$(build_jobs)" || fail "the build in $folder failed; the compiler's messages are above"
+}
+
+free_port() {
+  "$PYTHON" -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
+}
+
+# use_private_ros FOLDER: ROS talks to this machine only, on a port of its own, and writes its logs into FOLDER.
+use_private_ros() {
+  mkdir -p "$1"
+  unset ROS_HOSTNAME ROS_NAMESPACE
+  export ROS_IP=127.0.0.1
+  ROS_MASTER_URI="http://127.0.0.1:$(free_port)"
+  ROS_HOME="$(cd "$1" && pwd -P)"
+  export ROS_MASTER_URI ROS_HOME ROS_LOG_DIR="$ROS_HOME/log"
+}
+
+# source_setup FILE: catkin's setup files use unset variables.
+source_setup() {
+  [[ -f $1 ]] || fail "$1 is missing: build first"
+  set +u
+  # shellcheck disable=SC1090
+  source "$1"
+  set -u
+}
