@@ -21,11 +21,16 @@ struct IntensityOptions {
 };
 
 /// Running intensity scale of a scan, from the brain pixels of all slices so far.
+///
+/// The running estimate does not depend on the order of the slices; the scale in use follows it to within
+/// `hold_fraction`.
 class IntensityScale {
  public:
+  /// @throws std::invalid_argument naming the option that is out of range
   explicit IntensityScale(const IntensityOptions& options = {});
 
-  /// Adds one slice's brain pixels (at least one, finite). @return true if the scale in use changed.
+  /// Adds one slice's brain pixels (finite; those that are not positive do not count: they are background or clipped).
+  /// @return true if the scale in use changed.
   bool add(const std::vector<float>& brain_values);
   void clear();
 
