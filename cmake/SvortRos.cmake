@@ -5,7 +5,10 @@ find_package(catkin REQUIRED COMPONENTS
   std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
 find_package(OpenCV REQUIRED COMPONENTS core imgproc imgcodecs)
 find_package(VTK REQUIRED COMPONENTS CommonCore CommonDataModel FiltersCore)
-find_package(NIFTI REQUIRED)
+# Debian 12 ships a NIFTI package file whose paths do not exist, so the library is looked up by name.
+find_path(NIFTI_INCLUDE_DIR nifti2_io.h PATH_SUFFIXES nifti REQUIRED)
+find_library(NIFTI_LIBRARY nifti2 REQUIRED)
+find_library(ZNZ_LIBRARY znz REQUIRED)
 find_package(yaml-cpp REQUIRED)
 find_package(CLI11 REQUIRED)
 find_package(nlohmann_json REQUIRED)
@@ -20,8 +23,10 @@ catkin_package(
                  sensor_msgs std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
 
 svort_library(svort_io MODULE io
-  LINK svort_live NIFTI::niftiio yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json
+  LINK svort_live ${NIFTI_LIBRARY} ${ZNZ_LIBRARY} yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json
        opencv_core opencv_imgproc opencv_imgcodecs)
+target_include_directories(svort_io SYSTEM PRIVATE ${NIFTI_INCLUDE_DIR})
+target_compile_definitions(svort_io PRIVATE SVORT_VERSION="${PROJECT_VERSION}")
 
 svort_library(svort_ros_layer MODULE ros
   LINK svort_live svort_io ${catkin_LIBRARIES} VTK::CommonCore VTK::CommonDataModel VTK::FiltersCore)
