@@ -12,7 +12,8 @@ void LivePipeline::set_scan_end_callback(std::function<void(const LivePipeline&)
 }
 
 Arrival LivePipeline::add(const Slice& slice) {
-  if (!sequence_.scan_id().empty() && sequence_.check(slice).starts_scan) {
+  const bool other_scan = slice.info.scan_id != sequence_.scan_id();
+  if (other_scan && sequence_.check(slice).starts_scan) {
     finalise();
     if (on_scan_end_) on_scan_end_(*this);
     // The sequence forgets the old scan itself, in add(); it remembers that the scan has ended.
