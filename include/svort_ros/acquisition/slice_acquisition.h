@@ -15,9 +15,9 @@ struct AcquisitionMasks {
 
 /// Geometry shared by the acquisition operator and its adjoint. Works in voxels.
 struct AcquisitionGeometry {
-  torch::Tensor transforms;        ///< n x 3 x 4, trans_first, translation in voxels: slice coordinates -> volume
-  torch::Tensor psf;               ///< see gaussian_psf
-  double resolution_ratio = 1.0;   ///< slice pixel / voxel size
+  torch::Tensor transforms;       ///< n x 3 x 4, trans_first, translation in voxels: slice coordinates -> volume
+  torch::Tensor psf;              ///< see gaussian_psf
+  double resolution_ratio = 1.0;  ///< slice pixel / voxel size
 };
 
 /// A = D B T of the paper (sec. 2): the slices that the scanner would see of `volume`, exact formulation.

@@ -14,9 +14,9 @@ namespace svort {
 /// Voxel (i, j, k) lies at ((i - (nx-1)/2) sx, (j - (ny-1)/2) sy, (k - (nz-1)/2) sz) mm in grid coordinates, the
 /// convention of the public SVoRT implementation. Arrays on the grid are indexed [z][y][x], x fastest.
 struct ImageGrid {
-  Eigen::Vector3i size = Eigen::Vector3i::Zero();      ///< number of voxels along x, y, z
-  Eigen::Vector3d spacing = Eigen::Vector3d::Ones();   ///< voxel size along x, y, z, mm
-  Pose T_frame_grid = Pose::Identity();                ///< grid coordinates (mm) into the frame the grid lives in (mm)
+  Eigen::Vector3i size = Eigen::Vector3i::Zero();     ///< number of voxels along x, y, z
+  Eigen::Vector3d spacing = Eigen::Vector3d::Ones();  ///< voxel size along x, y, z, mm
+  Pose T_frame_grid = Pose::Identity();               ///< grid coordinates (mm) into the frame the grid lives in (mm)
 
   std::size_t voxel_count() const {
     return static_cast<std::size_t>(size.x()) * static_cast<std::size_t>(size.y()) * static_cast<std::size_t>(size.z());

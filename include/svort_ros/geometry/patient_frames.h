@@ -14,8 +14,8 @@ Eigen::Affine3d ras_from_lps(const Eigen::Affine3d& affine_lps);
 
 /// Geometry of one slice of a stack, taken from the stack's affine.
 struct SliceGeometry {
-  Pose T_scanner_slice = Pose::Identity();             ///< origin at the slice centre, x along columns, y along rows, mm
-  Eigen::Vector2d pixel_spacing = {1., 1.};            ///< x (between columns), y (between rows), mm
+  Pose T_scanner_slice = Pose::Identity();   ///< origin at the slice centre, x along columns, y along rows, mm
+  Eigen::Vector2d pixel_spacing = {1., 1.};  ///< x (between columns), y (between rows), mm
 };
 
 /// Pose and pixel spacing of slice `index` (third axis) of a stack of `columns` x `rows` pixels.

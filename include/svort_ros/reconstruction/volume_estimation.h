@@ -17,23 +17,28 @@ torch::Tensor reconstruct_psf(const torch::Tensor& slices, const AcquisitionGeom
 
 /// When conjugate gradients stop.
 struct ConjugateGradientOptions {
-  int iterations = 2;      ///< at most so many; 0 returns the start
-  double tolerance = 0.;   ///< stop when |r| <= tolerance * |b|; 0 never stops early
+  int iterations = 2;     ///< at most so many; 0 returns the start
+  double tolerance = 0.;  ///< stop when |r| <= tolerance * |b|; 0 never stops early
 };
 
 /// What a solve did.
 struct ConjugateGradientReport {
   int iterations = 0;
-  std::vector<double> relative_residual;  ///< |r| / |b| before the first and after every iteration
+  /// |r| / |b| before the first and after every iteration, b = A^T W y (|r| itself if b is 0). It is the residual of
+  /// the linear system, before the clamp.
+  std::vector<double> relative_residual;
 };
 
 /// Conjugate gradients on the paper's weighted inverse problem, argmin_x sum_i w_i |A_i x - y_i|^2.
 ///
-/// Solves A^T W A x = A^T W y from `start`; the result is clamped at 0, as the public implementation does.
+/// Solves A^T W A x = A^T W y from `start`; the result is clamped at 0, as the public implementation does. The result
+/// does not depend on the number of threads.
 ///
-/// @param slices  y, n x 1 x h x w
-/// @param weights w, n; an undefined tensor means 1
+/// @param slices  y, n x 1 x h x w, float32, CPU
+/// @param weights w, n, float32; an undefined tensor means 1
 /// @param start   D x H x W, usually reconstruct_psf()
+/// @throws std::invalid_argument naming the argument if a shape, type or device does not fit, an option is out of
+///         range, or a weight is negative or not finite
 torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
                                      const torch::Tensor& weights, const torch::Tensor& start,
                                      const ConjugateGradientOptions& options, const AcquisitionMasks& masks = {},
@@ -42,5 +47,22 @@ torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const Acquisit
 /// A^T W A x, the normal operator of the weighted inverse problem.
 torch::Tensor apply_normal_operator(const torch::Tensor& volume, const AcquisitionGeometry& geometry, int height,
                                     int width, const torch::Tensor& weights, const AcquisitionMasks& masks = {});
+
+/// Gradient descent with an edge-preserving prior, for a last refinement.
+struct EdgePreservingOptions {
+  int iterations = 2;      ///< steps
+  double step = 0.5;       ///< alpha: length of a step; lower it if slices have weights well above 1
+  double strength = 0.02;  ///< beta: weight of the prior; raise it for noisy slices
+  double edge = 0.1;       ///< delta: intensity difference that counts as an edge, in units of the volume
+};
+
+/// Steps x <- x - alpha (A^T W (A x - y) + beta delta^2 dR(x)), clamped at 0 in the end, with
+/// dR(x)_v = sum over the 26 neighbours u of d / sqrt(1 + (x_v - x_u) d), d = (x_v - x_u) / (|v - u|^2 delta^2).
+///
+/// The rim of the volume, one voxel wide, has no prior. Matches the public implementation's gradient-descent mode.
+/// Arguments and errors as in solve_weighted_inverse().
+torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+                                     const torch::Tensor& weights, const torch::Tensor& start,
+                                     const EdgePreservingOptions& options, const AcquisitionMasks& masks = {});
 
 }  // namespace svort
