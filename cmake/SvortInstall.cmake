@@ -63,3 +63,7 @@ if(SVORT_WITH_ROS)
   install(DIRECTORY launch config DESTINATION ${svort_share_dir})
   install(DIRECTORY data/real DESTINATION ${svort_share_dir}/data)
 endif()
+
+if(SVORT_BUILD_TESTS)
+  add_subdirectory(test/scripts)
+endif()

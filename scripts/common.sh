@@ -27,10 +27,12 @@ build_jobs() {
   echo "$jobs"
 }
 
-# configure_and_build FOLDER [CMAKE_ARGUMENT...]
+# configure_and_build FOLDER "TARGETS" [CMAKE_ARGUMENT...]; no targets means all.
 configure_and_build() {
-  local folder=$1
-  shift
+  local folder=$1 targets
+  read -r -a targets <<<"$2"
+  shift 2
+  mkdir -p "$folder"
   say "Configure $folder"
   cmake -S . -B "$folder" -G Ninja -DPYTHON_EXECUTABLE=$PYTHON -DPython3_EXECUTABLE=$PYTHON "$@" >"$folder.log" 2>&1 || {
     cat "$folder.log" >&2
@@ -38,7 +40,7 @@ configure_and_build() {
   }
   mv "$folder.log" "$folder/configure.log"
   say "Build $folder with $(build_jobs) jobs"
-  ninja -C "$folder" -j "$(build_jobs)" || fail "the build in $folder failed; the compiler's messages are above"
+  ninja -C "$folder" -j "$(build_jobs)" "${targets[@]}" || fail "the build in $folder failed; the compiler's messages are above"
 }
 
 free_port() {
@@ -53,6 +55,47 @@ use_private_ros() {
   ROS_MASTER_URI="http://127.0.0.1:$(free_port)"
   ROS_HOME="$(cd "$1" && pwd -P)"
   export ROS_MASTER_URI ROS_HOME ROS_LOG_DIR="$ROS_HOME/log"
+}
+
+# start SIGNAL COMMAND...: runs it in the background; stop_all ends it with that signal, the newest process first.
+# Programs of roscpp and roslaunch end cleanly on INT; rviz leaves INT alone, which is off in background processes.
+started=()
+start() {
+  local signal=$1
+  shift
+  "$@" &
+  started+=("$signal $!")
+}
+stop() {
+  local i
+  kill "-$1" "$2" 2>/dev/null || return 0
+  for ((i = 0; i < 100; ++i)); do
+    kill -0 "$2" 2>/dev/null || return 0
+    sleep 0.1
+  done
+  kill -KILL "$2" 2>/dev/null || true
+}
+stop_all() {
+  local i signal pid
+  for ((i = ${#started[@]} - 1; i >= 0; --i)); do
+    read -r signal pid <<<"${started[i]}"
+    stop "$signal" "$pid"
+  done
+  started=()
+}
+
+# start_master: a ROS master at ROS_MASTER_URI; returns when it answers.
+start_master() {
+  local i
+  mkdir -p "$ROS_LOG_DIR"
+  start INT roscore -p "${ROS_MASTER_URI##*:}" >"$ROS_LOG_DIR/roscore.txt" 2>&1
+  for ((i = 0; i < 150; ++i)); do
+    if rosparam get /run_id >/dev/null 2>&1; then return 0; fi
+    kill -0 "${started[-1]#* }" 2>/dev/null || break
+    sleep 0.2
+  done
+  cat "$ROS_LOG_DIR/roscore.txt" >&2
+  fail "roscore did not start at $ROS_MASTER_URI; its output is above"
 }
 
 # source_setup FILE: catkin's setup files use unset variables.
