@@ -12,9 +12,9 @@ namespace svort {
 /// A 3D NIfTI image; 2D files have size.z() == 1.
 struct NiftiImage {
   Eigen::Vector3i size = Eigen::Vector3i::Zero();
-  Eigen::Vector3d spacing = Eigen::Vector3d::Ones();                 ///< mm
-  Eigen::Affine3d affine_lps = Eigen::Affine3d::Identity();          ///< voxel indices (i, j, k) to LPS mm
-  std::vector<float> values;                                         ///< [k][j][i], scl_slope and scl_inter applied
+  Eigen::Vector3d spacing = Eigen::Vector3d::Ones();         ///< mm
+  Eigen::Affine3d affine_lps = Eigen::Affine3d::Identity();  ///< voxel indices (i, j, k) to LPS mm
+  std::vector<float> values;                                 ///< [k][j][i], scl_slope and scl_inter applied
 };
 
 /// Reads .nii or .nii.gz of any real datatype; sform if its code is positive, else qform, else an error.

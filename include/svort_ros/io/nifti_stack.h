@@ -11,10 +11,10 @@ namespace svort {
 
 /// How stacks in files were acquired; NIfTI does not say.
 struct StackTimingOptions {
-  int interleave = 2;          ///< every interleave-th slice, then the next pass; 1 is sequential
-  double tr_s = 1.2;           ///< time between slices, s
-  double thickness_mm = 0.;    ///< slice thickness; 0 takes the spacing between slices
-  double start_s = 1.;         ///< acquisition time of the first slice, s since the epoch
+  int interleave = 2;        ///< every interleave-th slice, then the next pass; 1 is sequential
+  double tr_s = 1.2;         ///< time between slices, s
+  double thickness_mm = 0.;  ///< slice thickness; 0 takes the spacing between slices
+  double start_s = 1.;       ///< acquisition time of the first slice, s since the epoch
 
   template <class Visitor>
   void visit(Visitor&& v) {

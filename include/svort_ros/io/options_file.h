@@ -2,7 +2,8 @@
 
 // Option structs describe themselves through a member template
 //
-//     template <class Visitor> void visit(Visitor&& v) { v("key", member, "help with unit"); v.section("name", struct); }
+//     template <class Visitor> void visit(Visitor&& v) { v("key", member, "help with unit"); v.section("name", struct);
+//     }
 //
 // so that one list serves YAML files, command lines, ROS parameters and run.json, and a default exists only once.
 

@@ -14,11 +14,12 @@ struct RunInfo {
   std::vector<std::string> inputs;  ///< files or topics
   std::uint64_t seed = 0;
   int threads = 0;
-  double wall_s = 0.;               ///< duration of the run, s
+  double wall_s = 0.;  ///< duration of the run, s
 };
 
 /// Writes poses.csv, updates.csv, volume.nii.gz, volume.png, latency.png and run.json into `directory`, which is made
-/// if needed. Without slices, only updates.csv and run.json. Each file is whole or not there.
+/// if needed. Without slices, only updates.csv and run.json; files of an earlier run that this one does not write are
+/// removed. Each file is whole or not there, and run.json comes last.
 /// @throws std::runtime_error naming the file and the reason
 void write_results(const std::filesystem::path& directory, const LivePipeline& pipeline, const RunInfo& run);
 

@@ -15,7 +15,8 @@ struct PoseRow {
   std::string scan_id;
   int stack = 0;
   int slice = 0;
-  double stamp = 0.;                        ///< s
+  std::int64_t stamp_ns = 0;                ///< acquisition time, ns since the epoch; exact
+  double stamp = 0.;                        ///< the same in s, to a microsecond or better
   Pose T_brain_slice = Pose::Identity();    ///< mm
   Pose T_scanner_brain = Pose::Identity();  ///< mm
   double weight = 1.;
@@ -27,10 +28,13 @@ struct PoseRow {
 /// @throws std::runtime_error naming the file and the reason
 void write_pose_table(const std::filesystem::path& path, const Estimate& estimate);
 
-/// Reads poses.csv or truth.csv. @throws std::runtime_error naming the file, the line and the column
+/// Reads poses.csv or truth.csv. Columns are found by their names; scan_id to qw must be there.
+/// @throws std::runtime_error naming the file, the line and the column: missing, unknown or repeated column, wrong
+///         number of fields, not a number, a pose that is not finite or a quaternion that is not of length 1 (1e-3)
 std::vector<PoseRow> read_pose_table(const std::filesystem::path& path);
 
-/// Writes updates.csv.
+/// Writes updates.csv, one row per arrival. Rejected slices have a pose of nan.
+/// @throws std::runtime_error naming the file and the reason
 void write_update_table(const std::filesystem::path& path, const Journal& journal);
 
 }  // namespace svort
