@@ -64,4 +64,28 @@ torch::Tensor gaussian_psf(const std::array<double, 3>& resolution_ratio, std::o
   return psf.div_(sum);
 }
 
+torch::Tensor stack_psfs(const std::vector<torch::Tensor>& psfs) {
+  if (psfs.empty()) throw std::invalid_argument("stack_psfs: no PSF given");
+  std::array<std::int64_t, 3> size = {1, 1, 1};
+  for (const torch::Tensor& psf : psfs) {
+    if (!psf.defined() || psf.dim() != 3) throw std::invalid_argument("stack_psfs: a PSF must be three-dimensional");
+    for (std::int64_t axis = 0; axis < 3; ++axis) {
+      if (psf.size(axis) % 2 == 0) throw std::invalid_argument("stack_psfs: a PSF must have an odd size");
+      auto& largest = size[static_cast<std::size_t>(axis)];
+      largest = std::max(largest, psf.size(axis));
+    }
+  }
+  torch::Tensor stacked =
+      torch::zeros({static_cast<std::int64_t>(psfs.size()), size[0], size[1], size[2]}, torch::kFloat32);
+  for (std::size_t i = 0; i < psfs.size(); ++i) {
+    torch::Tensor target = stacked[static_cast<std::int64_t>(i)];
+    for (std::int64_t axis = 0; axis < 3; ++axis) {
+      const std::int64_t count = psfs[i].size(axis);
+      target = target.narrow(axis, (size[static_cast<std::size_t>(axis)] - count) / 2, count);
+    }
+    target.copy_(psfs[i]);
+  }
+  return stacked;
+}
+
 }  // namespace svort

@@ -50,8 +50,10 @@ torch::Tensor checked(const torch::Tensor& tensor, const char* function, const c
 
 // Everything acquire_slices() and scatter_slices() share, checked and ready for plain loops.
 struct Problem {
-  torch::Tensor transforms, slices_mask, volume_mask;  // keep the memory alive
-  PsfTaps taps;
+  torch::Tensor transforms, psf_index, slices_mask, volume_mask;  // keep the memory alive
+  std::vector<PsfTaps> taps;                                      // one list per PSF
+  const std::int64_t* psf_of_slice = nullptr;                     // null if there is one PSF
+  std::size_t largest_psf = 0;                                    // most taps of any PSF
   VolumeShape shape;
   std::int32_t slices = 0, height = 0, width = 0;
   double resolution_ratio = 1.;
@@ -59,8 +61,9 @@ struct Problem {
   std::int64_t pixels_per_slice() const { return std::int64_t{height} * width; }
   const bool* volume_mask_data() const { return volume_mask.defined() ? volume_mask.data_ptr<bool>() : nullptr; }
 
-  SliceTaps slice_taps(const PsfTaps& list, std::int64_t slice) const {
-    return SliceTaps(list, transforms.data_ptr<float>() + 12 * slice, shape, width, height, resolution_ratio);
+  SliceTaps slice_taps(const std::vector<PsfTaps>& lists, std::int64_t slice) const {
+    const auto psf = psf_of_slice == nullptr ? std::size_t{0} : static_cast<std::size_t>(psf_of_slice[slice]);
+    return SliceTaps(lists[psf], transforms.data_ptr<float>() + 12 * slice, shape, width, height, resolution_ratio);
   }
 };
 
@@ -69,7 +72,10 @@ Problem check_problem(const char* function, const AcquisitionGeometry& geometry,
                       const AcquisitionMasks& masks) {
   Problem problem;
   problem.transforms = checked(geometry.transforms, function, "geometry.transforms", torch::kFloat32, {-1, 3, 4});
-  const torch::Tensor psf = checked(geometry.psf, function, "geometry.psf", torch::kFloat32, {-1, -1, -1});
+  const bool several = geometry.psf.defined() && geometry.psf.dim() == 4;
+  torch::Tensor psf =
+      checked(geometry.psf, function, "geometry.psf", torch::kFloat32,
+              several ? std::vector<std::int64_t>{-1, -1, -1, -1} : std::vector<std::int64_t>{-1, -1, -1});
   if (!torch::isfinite(problem.transforms).all().item<bool>()) {
     reject(function, "geometry.transforms holds values that are not finite");
   }
@@ -103,7 +109,18 @@ Problem check_problem(const char* function, const AcquisitionGeometry& geometry,
     problem.volume_mask = checked(masks.volume, function, "masks.volume", torch::kBool,
                                   {volume_shape[0], volume_shape[1], volume_shape[2]});
   }
-  problem.taps = nonzero_taps(psf.data_ptr<float>(), {psf.size(0), psf.size(1), psf.size(2)});
+  if (!several) psf = psf.unsqueeze(0);
+  if (several || geometry.psf_of_slice.defined()) {
+    problem.psf_index = checked(geometry.psf_of_slice, function, "geometry.psf_of_slice", torch::kInt64, {slices});
+    if (((problem.psf_index < 0) | (problem.psf_index >= psf.size(0))).any().item<bool>()) {
+      reject(function, "geometry.psf_of_slice must be in 0 .. " + std::to_string(psf.size(0) - 1));
+    }
+    problem.psf_of_slice = problem.psf_index.data_ptr<std::int64_t>();
+  }
+  for (std::int64_t i = 0; i < psf.size(0); ++i) {
+    problem.taps.push_back(nonzero_taps(psf[i].data_ptr<float>(), {psf.size(1), psf.size(2), psf.size(3)}));
+    problem.largest_psf = std::max(problem.largest_psf, problem.taps.back().count());
+  }
   problem.shape = {static_cast<std::int32_t>(volume_shape[2]), static_cast<std::int32_t>(volume_shape[1]),
                    static_cast<std::int32_t>(volume_shape[0])};
   problem.slices = static_cast<std::int32_t>(slices);
@@ -127,13 +144,13 @@ std::vector<std::int32_t> active_pixels(const Problem& problem) {
 
 // Calls visit(pixel, taps, centre) for pixels [begin, end) of `active`; a slice's taps are rotated once.
 template <class Visit>
-void for_each_pixel(const Problem& problem, const PsfTaps& list, const std::vector<std::int32_t>& active,
+void for_each_pixel(const Problem& problem, const std::vector<PsfTaps>& lists, const std::vector<std::int32_t>& active,
                     std::int64_t begin, std::int64_t end, const Visit& visit) {
   const std::int64_t per_slice = problem.pixels_per_slice();
   std::int64_t i = begin;
   while (i < end) {
     const std::int64_t slice = active[static_cast<std::size_t>(i)] / per_slice;
-    const SliceTaps taps = problem.slice_taps(list, slice);
+    const SliceTaps taps = problem.slice_taps(lists, slice);
     for (; i < end && active[static_cast<std::size_t>(i)] < (slice + 1) * per_slice; ++i) {
       const std::int32_t pixel = active[static_cast<std::size_t>(i)];
       const auto within = static_cast<std::int32_t>(pixel - slice * per_slice);
@@ -277,7 +294,8 @@ std::vector<float> pixel_scales(const Problem& problem, const std::vector<std::i
 template <int kChannels>
 void scatter(const Problem& problem, const float* slices, const std::vector<std::int32_t>& active, float* volume) {
   const std::vector<float> scales = pixel_scales(problem, active);
-  const PsfTaps spread = spread_taps(problem.taps);
+  std::vector<PsfTaps> spread;
+  for (const PsfTaps& taps : problem.taps) spread.push_back(spread_taps(taps));
   std::vector<std::int64_t> pixels_per_plane(static_cast<std::size_t>(problem.shape.depth), 0);
   {
     std::size_t i = 0;
@@ -290,7 +308,7 @@ void scatter(const Problem& problem, const float* slices, const std::vector<std:
   }
   const std::vector<Slab> slabs = balanced_slabs(pixels_per_plane, thread_count());
   parallel_chunks(static_cast<std::int64_t>(slabs.size()), [&](std::int64_t first_slab, std::int64_t last_slab) {
-    TapSamples samples(problem.taps.count());
+    TapSamples samples(problem.largest_psf);
     for (std::int64_t s = first_slab; s < last_slab; ++s) {
       const Slab slab = slabs[static_cast<std::size_t>(s)];
       std::size_t i = 0;
@@ -327,7 +345,7 @@ torch::Tensor acquire_slices(const torch::Tensor& volume, const AcquisitionGeome
   float* weight_values = weight != nullptr ? weights.data_ptr<float>() : nullptr;
   const std::vector<std::int32_t> active = active_pixels(problem);
   parallel_chunks(static_cast<std::int64_t>(active.size()), [&](std::int64_t begin, std::int64_t end) {
-    TapSamples samples(problem.taps.count());
+    TapSamples samples(problem.largest_psf);
     for_each_pixel(problem, problem.taps, active, begin, end,
                    [&](std::int32_t pixel, const SliceTaps& taps, const std::array<float, 3>& centre) {
                      taps.place(centre, &samples);

@@ -112,28 +112,24 @@ void NominalEstimator::reset() {
 
 void NominalEstimator::estimate_volume(const SliceSequence& sequence, int cg_iterations) {
   const torch::NoGradGuard no_grad;
-  const std::vector<SliceBatch> batches = make_slice_batches(sequence, estimate_.slices, grid_);
-  std::vector<SliceObservations> observations;
-  for (const SliceBatch& batch : batches) observations.push_back(batch.observations);
-
-  torch::Tensor volume = reconstruct_psf(observations, {grid_.size.z(), grid_.size.y(), grid_.size.x()});
+  const SliceBatch batch = make_slice_batch(sequence, estimate_.slices, grid_);
+  torch::Tensor volume =
+      reconstruct_psf(batch.pixels, batch.geometry, {grid_.size.z(), grid_.size.y(), grid_.size.x()}, batch.masks);
   if (cg_iterations > 0) {
     ConjugateGradientOptions options;
     options.iterations = cg_iterations;
-    volume = solve_weighted_inverse(observations, volume, options);
+    volume = solve_weighted_inverse(batch.pixels, batch.geometry, batch.weights, volume, options, batch.masks);
   }
 
-  for (const SliceBatch& batch : batches) {
-    const SliceObservations& o = batch.observations;
-    torch::Tensor coverage;
-    const torch::Tensor simulated = acquire_slices(volume, o.geometry, static_cast<int>(o.slices.size(2)),
-                                                   static_cast<int>(o.slices.size(3)), o.masks, &coverage);
-    const auto plane = static_cast<std::size_t>(o.slices.size(2) * o.slices.size(3));
-    for (std::size_t i = 0; i < batch.members.size(); ++i)
-      estimate_.slices[batch.members[i]].ncc = masked_correlation(
-          o.slices.data_ptr<float>() + i * plane, simulated.data_ptr<float>() + i * plane,
-          o.masks.slices.data_ptr<bool>() + i * plane, coverage.data_ptr<float>() + i * plane, plane);
-  }
+  const auto height = static_cast<int>(batch.pixels.size(2));
+  const auto width = static_cast<int>(batch.pixels.size(3));
+  torch::Tensor coverage;
+  const torch::Tensor simulated = acquire_slices(volume, batch.geometry, height, width, batch.masks, &coverage);
+  const auto plane = static_cast<std::size_t>(height) * static_cast<std::size_t>(width);
+  for (std::size_t i = 0; i < estimate_.slices.size(); ++i)
+    estimate_.slices[i].ncc = masked_correlation(
+        batch.pixels.data_ptr<float>() + i * plane, simulated.data_ptr<float>() + i * plane,
+        batch.masks.slices.data_ptr<bool>() + i * plane, coverage.data_ptr<float>() + i * plane, plane);
 
   volume_.grid = grid_;
   volume_.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());

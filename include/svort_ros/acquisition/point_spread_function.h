@@ -4,6 +4,7 @@
 
 #include <array>
 #include <optional>
+#include <vector>
 
 namespace svort {
 
@@ -17,5 +18,12 @@ namespace svort {
 /// @return float32, (2 rz + 1) x (2 ry + 1) x (2 rx + 1), indexed [z][y][x]
 /// @throws std::invalid_argument unless every ratio is finite and positive
 torch::Tensor gaussian_psf(const std::array<double, 3>& resolution_ratio, std::optional<int> r_max = std::nullopt);
+
+/// Several PSFs (stacks of different thickness) as one array: padded with zeros around their centres to a common size.
+///
+/// @param psfs at least one, each z x y x x of odd sizes
+/// @return psfs.size() x z x y x x
+/// @throws std::invalid_argument if there is none, or one is not three-dimensional or has an even size
+torch::Tensor stack_psfs(const std::vector<torch::Tensor>& psfs);
 
 }  // namespace svort
