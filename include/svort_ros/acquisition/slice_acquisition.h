@@ -18,7 +18,7 @@ struct AcquisitionGeometry {
   torch::Tensor transforms;       ///< n x 3 x 4, trans_first, translation in voxels: slice coordinates -> volume
   torch::Tensor psf;              ///< z x y x x, see gaussian_psf; or m x z x y x x, stacked by stack_psfs
   double resolution_ratio = 1.0;  ///< slice pixel / voxel size
-  torch::Tensor psf_of_slice;     ///< n, int64: which of the m each slice has; undefined if psf is a single one
+  torch::Tensor psf_of_slice{};   ///< n, int64: which of the m each slice has; undefined if psf is a single one
 };
 
 /// A = D B T of the paper (sec. 2): the slices that the scanner would see of `volume`, exact formulation.
