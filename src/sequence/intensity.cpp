@@ -14,7 +14,7 @@ constexpr std::size_t kPixelsPerSample = 16;
 void require(bool ok, const char* option, double value, const char* limit) {
   if (ok) return;
   std::ostringstream message;
-  message << "intensity." << option << " is " << value << ", must be " << limit;
+  message << "sequence.intensity." << option << " is " << value << ", must be " << limit;
   throw std::invalid_argument(message.str());
 }
 
