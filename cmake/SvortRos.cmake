@@ -19,6 +19,7 @@ generate_messages(DEPENDENCIES geometry_msgs sensor_msgs std_msgs)
 catkin_package(
   INCLUDE_DIRS include
   LIBRARIES svort_geometry svort_acquisition svort_reconstruction svort_sequence svort_live svort_io svort_ros_layer
+            svort_nodelet
   CATKIN_DEPENDS diagnostic_updater geometry_msgs message_runtime nodelet pluginlib rosbag roscpp rosgraph_msgs
                  sensor_msgs std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
 
@@ -33,3 +34,25 @@ svort_library(svort_ros_layer MODULE ros
 target_include_directories(svort_ros_layer SYSTEM PUBLIC ${catkin_INCLUDE_DIRS} ${CATKIN_DEVEL_PREFIX}/include)
 add_dependencies(svort_ros_layer ${PROJECT_NAME}_generate_messages_cpp)
 list(APPEND SVORT_LIBRARIES svort_io svort_ros_layer)
+
+# Programs and the nodelet's library, where rosrun, roslaunch and pluginlib look for them.
+foreach(program svort_node stack_player_node svort_replay nifti_to_bag)
+  add_executable(${program} src/apps/${program}.cpp)
+  target_link_libraries(${program} PRIVATE svort_ros_layer)
+  svort_target_options(${program})
+  set_target_properties(${program} PROPERTIES
+    RUNTIME_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_BIN_DESTINATION})
+endforeach()
+
+add_library(svort_nodelet SHARED src/apps/svort_nodelet.cpp)
+target_link_libraries(svort_nodelet PUBLIC svort_ros_layer)
+svort_target_options(svort_nodelet)
+set_target_properties(svort_nodelet PROPERTIES
+  LIBRARY_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_LIB_DESTINATION})
+list(APPEND SVORT_LIBRARIES svort_nodelet)
+
+# Tests with a ROS master of their own.
+if(SVORT_BUILD_TESTS)
+  enable_testing()
+  add_subdirectory(test/ros)
+endif()

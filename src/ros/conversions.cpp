@@ -438,6 +438,7 @@ sensor_msgs::PointCloud2 to_cloud(const svort::Volume& volume, double threshold,
                                 "z", 1, sensor_msgs::PointField::FLOAT32, "intensity", 1,
                                 sensor_msgs::PointField::FLOAT32);
   modifier.resize(static_cast<std::size_t>(std::count_if(volume.values.begin(), volume.values.end(), is_shown)));
+  if (cloud.data.empty()) return cloud;  // an iterator needs a first point
   sensor_msgs::PointCloud2Iterator<float> point(cloud, "x");
   const Eigen::Vector3i& size = volume.grid.size;
   for (int k = 0; k < size.z(); ++k)
