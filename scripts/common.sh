@@ -10,6 +10,9 @@ cd "$ROOT"
 PYTHON=/usr/bin/python3
 export PATH="/usr/bin:$PATH"
 
+# Copies of the project in other folders share what ccache has compiled.
+export CCACHE_BASEDIR="$ROOT"
+
 say() { printf '== %s\n' "$*"; }
 fail() {
   printf 'error: %s\n' "$*" >&2

@@ -8,7 +8,7 @@ int main() {
   svort::Slice slice;
   slice.info.scan_id = "consumer";
   slice.info.slices_in_stack = 1;
-  slice.info.T_scanner_slice.translation() = {0., 0., 12.};
+  slice.info.T_scanner_slice.translation().z() = 12.;
   slice.info.pixel_spacing = {2., 2.};
   slice.info.thickness = 3.;
   slice.info.columns = slice.info.rows = 32;
