@@ -24,7 +24,7 @@ class YamlReader {
   YamlReader(const YAML::Node& node, std::string file, std::string prefix)
       : node_(node), file_(std::move(file)), prefix_(std::move(prefix)) {
     if (node_ && !node_.IsNull() && !node_.IsMap())
-      throw std::runtime_error(file_ + ": " + (prefix_.empty() ? "the file" : "'" + prefix_ + "'") + " must be a map");
+      throw std::runtime_error(file_ + ": " + where() + " must hold keys and values");
   }
 
   template <class T>
@@ -45,15 +45,21 @@ class YamlReader {
     options.visit(reader);
     reader.reject_unknown();
   }
+  /// Also repeated keys: YAML forbids them, but the parser would silently take one of the values.
   void reject_unknown() const {
     if (!node_ || !node_.IsMap()) return;
+    std::set<std::string> seen;
     for (const auto& entry : node_) {
-      const auto key = entry.first.as<std::string>();
+      if (!entry.first.IsScalar()) throw std::runtime_error(file_ + ": a key of " + where() + " is not a plain word");
+      const std::string& key = entry.first.Scalar();
       if (!known_.count(key)) throw std::runtime_error(file_ + ": unknown key '" + prefix_ + key + "'");
+      if (!seen.insert(key).second) throw std::runtime_error(file_ + ": '" + prefix_ + key + "' is there twice");
     }
   }
 
  private:
+  std::string where() const { return prefix_.empty() ? "the file" : "'" + prefix_.substr(0, prefix_.size() - 1) + "'"; }
+
   YAML::Node node_;
   std::string file_;
   std::string prefix_;
@@ -99,11 +105,13 @@ class JsonWriter {
 
 }  // namespace options_detail
 
-/// Overwrites the members that the YAML file names; all others keep their values.
-/// @throws std::runtime_error naming the file and the key: missing file, syntax error, unknown key, wrong type
+/// Overwrites the members that the YAML file names; all others keep their values, and after an error all do.
+/// @throws std::runtime_error naming the file and the key: missing file, syntax error, unknown or repeated key, wrong
+///         type
 template <class Options>
 void load_options(const std::filesystem::path& file, Options& options) {
   YAML::Node root;
+  if (std::filesystem::is_directory(file)) throw std::runtime_error(file.string() + ": is a folder, not a file");
   try {
     root = YAML::LoadFile(file.string());
   } catch (const YAML::BadFile&) {
@@ -112,8 +120,10 @@ void load_options(const std::filesystem::path& file, Options& options) {
     throw std::runtime_error(file.string() + ": " + error.what());
   }
   options_detail::YamlReader reader(root, file.string(), "");
-  options.visit(reader);
+  Options loaded = options;
+  loaded.visit(reader);
   reader.reject_unknown();
+  options = loaded;
 }
 
 /// Adds one command-line option per member, "--section.key". What the line says overrides what the struct holds.
