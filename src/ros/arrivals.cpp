@@ -72,6 +72,12 @@ std::string progress_head(const ScanProgress& progress, const svort::SliceInfo& 
                svort::to_string(status));
 }
 
+std::string rejection_line(const std::string& head, const svort::JournalEntry& entry) {
+  const std::string place = svort::describe(entry.info) + ": ";  // the head says it already
+  const bool repeated = entry.reason.compare(0, place.size(), place) == 0;
+  return head + "  " + (repeated ? entry.reason.substr(place.size()) : entry.reason);
+}
+
 std::string progress_line(const std::string& head, const svort::JournalEntry& entry, const svort::SliceEstimate& first,
                           const svort::SliceEstimate& slice) {
   const HeadDisplacement displacement = head_displacement(first, slice);

@@ -2,6 +2,7 @@
 
 #include <ros/param.h>
 
+#include <algorithm>
 #include <cmath>
 #include <sstream>
 #include <utility>
@@ -21,6 +22,18 @@ void require(bool condition, const char* option, const Value& value, const char*
 
 bool is_frame_name(const std::string& name) {
   return !name.empty() && name.front() != '/' && name.find_first_of(" \t\n") == std::string::npos;
+}
+
+/// Command lines and launch files can pass strings only: "[a, b]", or words with blanks between them.
+std::vector<std::string> split(std::string text) {
+  if (text.size() >= 2 && text.front() == '[' && text.back() == ']') {
+    text = text.substr(1, text.size() - 2);
+    std::replace(text.begin(), text.end(), ',', ' ');
+  }
+  std::istringstream line(text);
+  std::vector<std::string> words;
+  for (std::string word; line >> word;) words.push_back(word);
+  return words;
 }
 
 bool is_fraction(double value) { return value > 0. && value < 1.; }
@@ -98,9 +111,8 @@ void ParameterReader::operator()(const std::string& key, std::vector<std::string
   XmlRpcValue* node = find(key);
   if (!node) return;
   std::vector<std::string> words;
-  if (node->getType() == XmlRpcValue::TypeString) {  // a launch file's argument: names with blanks between them
-    std::istringstream line(static_cast<std::string>(*node));
-    for (std::string word; line >> word;) words.push_back(word);
+  if (node->getType() == XmlRpcValue::TypeString) {
+    words = split(static_cast<std::string>(*node));
   } else if (node->getType() == XmlRpcValue::TypeArray) {
     for (int i = 0; i < node->size(); ++i) {
       if ((*node)[i].getType() != XmlRpcValue::TypeString) wrong_type(key, "a list of strings");

@@ -136,7 +136,7 @@ ReplaySummary replay(const ReplayOptions& options) {
       const std::string head = progress_head(progress, entry.info, arrival.status);
       ++summary.arrivals;
       if (!svort::is_kept(arrival.status)) {
-        display.show(summary.arrivals, head + "  " + arrival.reason);
+        display.show(summary.arrivals, rejection_line(head, entry));
         continue;
       }
       ++summary.kept;

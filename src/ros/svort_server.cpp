@@ -206,9 +206,9 @@ void SvortServer::Worker::answer(const Slice& message, Clock::time_point arrived
       awaiting_volume_.add({number, arrived, head});
       estimate_is_new_ = true;
     } else if (arrival.status == svort::ArrivalStatus::empty_mask) {  // normal at the ends of a stack
-      ROS_INFO("%s  %s", head.c_str(), arrival.reason.c_str());
+      ROS_INFO("%s", rejection_line(head, entry).c_str());
     } else {
-      ROS_WARN("%s  %s", head.c_str(), arrival.reason.c_str());
+      ROS_WARN("%s", rejection_line(head, entry).c_str());
     }
 
     status.status = to_status_code(arrival.status);

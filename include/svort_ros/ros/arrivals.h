@@ -45,6 +45,9 @@ class ScanProgress {
 /// "[ 12/ 66] stack 0 slice  4  accepted", the beginning of a slice's line in every progress display.
 std::string progress_head(const ScanProgress& progress, const svort::SliceInfo& info, svort::ArrivalStatus status);
 
+/// The line of a rejected slice: head and reason.
+std::string rejection_line(const std::string& head, const svort::JournalEntry& entry);
+
 /// The line of a kept slice: head, latencies, head motion, where the pose comes from.
 std::string progress_line(const std::string& head, const svort::JournalEntry& entry, const svort::SliceEstimate& first,
                           const svort::SliceEstimate& slice);
