@@ -29,9 +29,12 @@ double quantile(const std::vector<double>& sorted, double q) {
   return sorted[lower] + (position - static_cast<double>(lower)) * (sorted[upper] - sorted[lower]);
 }
 
+/// Times and sizes to three decimals; NaN stays and becomes null.
+double rounded(double value) { return std::round(value * 1000.) / 1000.; }
+
 Json percentiles_to_json(const std::vector<double>& values) {
   const Percentiles p = percentiles(values);
-  return Json{{"median", p.median}, {"p95", p.p95}, {"max", p.max}};  // NaN becomes null
+  return Json{{"median", rounded(p.median)}, {"p95", rounded(p.p95)}, {"max", rounded(p.max)}};
 }
 
 Json ncc_to_json(std::vector<double> values) {
@@ -95,8 +98,8 @@ std::string run_json(const LivePipeline& pipeline, const RunInfo& run) {
   json["intensity_scale"] = sequence.intensity_scale();
   json["ncc"] = quality_to_json(pipeline.estimate());
   json["latency"] = latency_to_json(pipeline.journal());
-  json["wall_s"] = run.wall_s;
-  json["peak_memory_mib"] = peak_memory_mib();
+  json["wall_s"] = rounded(run.wall_s);
+  json["peak_memory_mib"] = rounded(peak_memory_mib());
   json["options"] = options_to_json(pipeline.options());
   // A scan id may hold any bytes; what is not UTF-8 is replaced instead of losing the file.
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";

@@ -18,7 +18,7 @@ using Nifti = Scratch;
 const std::filesystem::path kRealStack = std::filesystem::path(SVORT_SOURCE_DIR) / "data/real/sub-01_run-1_T2w.nii.gz";
 
 template <class T>
-void expect_reads(const Scratch&, const std::filesystem::path& file, const std::vector<T>& values) {
+void expect_reads(const std::filesystem::path& file, const std::vector<T>& values) {
   const NiftiImage image = read_nifti(file);
   EXPECT_EQ(image.size, Eigen::Vector3i(2, 1, 2));
   ASSERT_EQ(image.values.size(), values.size());
@@ -30,7 +30,7 @@ TEST_F(Nifti, ReadsEveryRealTypeOfEitherEndianness) {
     for (const bool big_endian : {false, true}) {
       SCOPED_TRACE(std::to_string(code) + (big_endian ? " big-endian" : " little-endian"));
       const auto file = write("a.nii", RawNifti(2, 1, 2, code, big_endian).values(values).bytes());
-      expect_reads(*this, file, values);
+      expect_reads(file, values);
     }
   };
   check(2, std::vector<std::uint8_t>{0, 1, 200, 255});
@@ -98,6 +98,34 @@ TEST_F(Nifti, PlaneIsOneSlice) {
   RawNifti raw(3, 2, 1, 2);
   raw.put<std::int16_t>(40, 2).values<std::uint8_t>({1, 2, 3, 4, 5, 6});
   EXPECT_EQ(read_nifti(write("a.nii", raw.bytes())).size, Eigen::Vector3i(3, 2, 1));
+}
+
+/// NIfTI-2 has another, wider header (offsets as in its standard).
+TEST_F(Nifti, ReadsNifti2) {
+  std::string bytes(544, '\0');
+  const auto put = [&bytes](std::size_t offset, auto value) { std::memcpy(&bytes[offset], &value, sizeof(value)); };
+  put(0, std::int32_t{540});
+  const std::string magic("n+2\0\r\n\x1a\n", 8);
+  bytes.replace(4, 8, magic);
+  put(12, std::int16_t{4});   // int16
+  put(14, std::int16_t{16});  // bits
+  const std::array<std::int64_t, 8> dim = {3, 2, 1, 2, 1, 1, 1, 1};
+  for (std::size_t i = 0; i < 8; ++i) put(16 + 8 * i, dim[i]);
+  for (std::size_t i = 0; i < 8; ++i) put(104 + 8 * i, 1.);
+  put(168, std::int64_t{544});
+  put(176, 2.);               // scl_slope
+  put(348, std::int32_t{1});  // sform_code
+  const std::array<double, 12> sform = {1., 0., 0., 10., 0., 2., 0., 20., 0., 0., 3., 30.};
+  for (std::size_t i = 0; i < 12; ++i) put(400 + 8 * i, sform[i]);
+  put(500, std::int32_t{2});  // mm
+  for (const std::int16_t value : std::vector<std::int16_t>{1, -2, 300, 4}) {
+    bytes.resize(bytes.size() + 2);
+    put(bytes.size() - 2, value);
+  }
+  const NiftiImage image = read_nifti(write("a.nii", bytes));
+  EXPECT_EQ(image.size, Eigen::Vector3i(2, 1, 2));
+  EXPECT_EQ(image.values, (std::vector<float>{2.F, -4.F, 600.F, 8.F}));
+  EXPECT_TRUE((image.affine_lps * Eigen::Vector3d(1., 0., 1.)).isApprox(Eigen::Vector3d(-11., -20., 33.)));
 }
 
 TEST_F(Nifti, NamesFileAndFault) {
