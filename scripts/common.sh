@@ -58,6 +58,8 @@ use_private_ros() {
   ROS_MASTER_URI="http://127.0.0.1:$(free_port)"
   ROS_HOME="$(cd "$1" && pwd -P)"
   export ROS_MASTER_URI ROS_HOME ROS_LOG_DIR="$ROS_HOME/log"
+  # A line appears when it is said, also where it is not written to a terminal.
+  export ROSCONSOLE_STDOUT_LINE_BUFFERED=1
 }
 
 # start SIGNAL COMMAND...: runs it in the background; stop_all ends it with that signal, the newest process first.
@@ -100,6 +102,27 @@ start_master() {
   cat "$ROS_LOG_DIR/roscore.txt" >&2
   fail "roscore did not start at $ROS_MASTER_URI; its output is above"
 }
+
+# plain_output: without the colours of rosconsole.
+plain_output() { sed -u 's/\x1b\[[0-9;]*m//g'; }
+
+# play PROGRAMS_DIR NODE_PID FACTOR STACK... MASK...: sends the stacks, the player being the scanner, while the node
+# lives. More parameters of the player can be set with rosparam before.
+play() {
+  local programs=$1 node=$2 factor=$3 half player
+  shift 3
+  half=$(($# / 2))
+  rosparam set /stack_player/stacks "[$(join "${@:1:half}")]"
+  rosparam set /stack_player/masks "[$(join "${@:half+1}")]"
+  start INT "$programs/stack_player_node" __name:=stack_player "_realtime:=$factor"
+  player=${started[-1]#* }
+  while kill -0 "$player" 2>/dev/null; do
+    kill -0 "$node" 2>/dev/null || return 1
+    sleep 0.2
+  done
+  wait "$player"
+}
+join() { local IFS=,; echo "$*"; }
 
 # source_setup FILE: catkin's setup files use unset variables.
 source_setup() {
