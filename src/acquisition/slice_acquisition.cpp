@@ -9,6 +9,7 @@
 #include <string>
 #include <vector>
 
+#include "float4.h"
 #include "parallel.h"
 #include "tap_sampler.h"
 
@@ -159,17 +160,12 @@ void for_each_pixel(const Problem& problem, const std::vector<PsfTaps>& lists, c
   }
 }
 
-// Trilinear interpolation. Products of weights, not v + w (u - v), so that a voxel outside a mask (0) cancels exactly
-// and a tiny share inside keeps its relative accuracy.
-inline float interpolate(const float* cell, std::int32_t stride_x, std::int32_t stride_y, std::int32_t stride_z,
-                         float wx, float wy, float wz) {
-  const float ux = 1.F - wx, uy = 1.F - wy, uz = 1.F - wz;
-  const float* above = cell + stride_z;
-  const float x00 = ux * cell[0] + wx * cell[stride_x];
-  const float x10 = ux * cell[stride_y] + wx * cell[stride_y + stride_x];
-  const float x01 = ux * above[0] + wx * above[stride_x];
-  const float x11 = ux * above[stride_y] + wx * above[stride_y + stride_x];
-  return uz * (uy * x00 + wy * x10) + wz * (uy * x01 + wy * x11);
+// Shares of the columns and rows of a cell, {x0 y0, x1 y0, x0 y1, x1 y1}. Products of weights, not v + w (u - v): a
+// voxel outside a mask then cancels exactly, and a tiny share inside keeps its relative accuracy.
+inline Float4 plane_shares(float wx, float wy) {
+  const Float4 x = Float4{1.F, 0.F, 1.F, 0.F} + splat(wx) * Float4{-1.F, 1.F, -1.F, 1.F};
+  const Float4 y = Float4{1.F, 1.F, 0.F, 0.F} + splat(wy) * Float4{-1.F, -1.F, 1.F, 1.F};
+  return x * y;
 }
 
 struct PixelSum {
@@ -177,27 +173,31 @@ struct PixelSum {
 };
 
 PixelSum gather(const float* volume, const VolumeShape& shape, const TapSamples& samples) {
-  PixelSum sum;
+  const std::ptrdiff_t stride_y = shape.stride_y(), stride_z = shape.stride_z();
+  Float4 sum = splat(0.F);
   for (std::size_t t = 0; t < samples.count; ++t) {
-    sum.value += samples.value[t] * interpolate(volume + samples.index[t], 1, shape.stride_y(), shape.stride_z(),
-                                                samples.wx[t], samples.wy[t], samples.wz[t]);
-    sum.weight += samples.value[t];
+    const float* below = volume + samples.index[t];
+    const float* above = below + stride_z;
+    const Float4 column = splat(samples.lower[t]) * load_pairs(below, below + stride_y) +
+                          splat(samples.upper[t]) * load_pairs(above, above + stride_y);
+    sum += plane_shares(samples.wx[t], samples.wy[t]) * column;
   }
-  return sum;
+  return {(sum[0] + sum[1]) + (sum[2] + sum[3]), samples.weight};
 }
 
 // As gather(), on pairs (value inside the mask or 0, 1 inside the mask or 0).
 PixelSum gather_masked(const float* pairs, const VolumeShape& shape, const TapSamples& samples) {
-  PixelSum sum;
-  const std::int32_t stride_y = 2 * shape.stride_y(), stride_z = 2 * shape.stride_z();
+  const std::ptrdiff_t stride_y = 2 * shape.stride_y(), stride_z = 2 * std::ptrdiff_t{shape.stride_z()};
+  Float4 sum = splat(0.F);
   for (std::size_t t = 0; t < samples.count; ++t) {
-    const float* cell = pairs + 2 * static_cast<std::ptrdiff_t>(samples.index[t]);
-    sum.value +=
-        samples.value[t] * interpolate(cell, 2, stride_y, stride_z, samples.wx[t], samples.wy[t], samples.wz[t]);
-    sum.weight +=
-        samples.value[t] * interpolate(cell + 1, 2, stride_y, stride_z, samples.wx[t], samples.wy[t], samples.wz[t]);
+    const float* below = pairs + 2 * std::ptrdiff_t{samples.index[t]};
+    const float* above = below + stride_z;
+    const float wx = samples.wx[t], wy = samples.wy[t], lower = samples.lower[t], upper = samples.upper[t];
+    const Float4 row = splat((1.F - wy) * lower) * load4(below) + splat(wy * lower) * load4(below + stride_y) +
+                       splat((1.F - wy) * upper) * load4(above) + splat(wy * upper) * load4(above + stride_y);
+    sum += Float4{1.F - wx, 1.F - wx, wx, wx} * row;
   }
-  return sum;
+  return {sum[0] + sum[2], sum[1] + sum[3]};
 }
 
 std::vector<float> masked_pairs(const float* volume, const bool* mask, std::int64_t count) {
@@ -209,28 +209,32 @@ std::vector<float> masked_pairs(const float* volume, const bool* mask, std::int6
   return pairs;
 }
 
-// Adds `value` times the tap's weights to one plane of its cell; kChannels = 2 adds the weights themselves beside.
+// One plane of a tap's cell, for a pixel's value; kChannels = 2 adds the weights themselves beside the values.
 template <int kChannels>
-inline void add_plane(float* cell, std::int32_t stride_y, float wx, float wy, float share, float value) {
-  const float lower = (1.F - wy) * share, upper = wy * share;
-  const std::array<float, 4> weight = {(1.F - wx) * lower, wx * lower, (1.F - wx) * upper, wx * upper};
-  if constexpr (kChannels == 1) {
-    cell[0] += weight[0] * value;
-    cell[1] += weight[1] * value;
-    cell[stride_y] += weight[2] * value;
-    cell[stride_y + 1] += weight[3] * value;
-  } else {
-    float* next = cell + 2 * static_cast<std::ptrdiff_t>(stride_y);
-    cell[0] += weight[0] * value;
-    cell[1] += weight[0];
-    cell[2] += weight[1] * value;
-    cell[3] += weight[1];
-    next[0] += weight[2] * value;
-    next[1] += weight[2];
-    next[2] += weight[3] * value;
-    next[3] += weight[3];
+struct PlaneTerm;
+
+template <>
+struct PlaneTerm<1> {
+  Float4 shares;
+
+  PlaneTerm(float wx, float wy, float value) : shares(plane_shares(wx, wy) * splat(value)) {}
+  void add(float weight, std::ptrdiff_t stride_y, float* cell) const {
+    store_pairs(load_pairs(cell, cell + stride_y) + splat(weight) * shares, cell, cell + stride_y);
   }
-}
+};
+
+template <>
+struct PlaneTerm<2> {
+  Float4 row;
+  float wy;
+
+  PlaneTerm(float wx, float wy_, float value) : row{(1.F - wx) * value, 1.F - wx, wx * value, wx}, wy(wy_) {}
+  void add(float weight, std::ptrdiff_t stride_y, float* cell) const {
+    float* next = cell + 2 * stride_y;
+    store4(load4(cell) + splat((1.F - wy) * weight) * row, cell);
+    store4(load4(next) + splat(wy * weight) * row, next);
+  }
+};
 
 // One slab of planes [first, last) of the volume, written by one thread only.
 struct Slab {
@@ -240,18 +244,16 @@ struct Slab {
 template <int kChannels>
 void scatter_pixel(const TapSamples& samples, const VolumeShape& shape, const Slab& slab, bool crosses, float scale,
                    float value, float* volume) {
-  const std::int32_t stride_y = shape.stride_y(), stride_z = shape.stride_z();
+  const std::ptrdiff_t stride_y = shape.stride_y(), stride_z = shape.stride_z();
   for (std::size_t t = 0; t < samples.count; ++t) {
-    const float share = samples.value[t] * scale;
-    float* cell = volume + kChannels * static_cast<std::ptrdiff_t>(samples.index[t]);
-    const float wx = samples.wx[t], wy = samples.wy[t], wz = samples.wz[t];
-    const std::int32_t plane = crosses ? samples.index[t] / stride_z : slab.first;
+    float* cell = volume + kChannels * std::ptrdiff_t{samples.index[t]};
+    const PlaneTerm<kChannels> term(samples.wx[t], samples.wy[t], value);
+    const std::int32_t plane = crosses ? samples.index[t] / shape.stride_z() : slab.first;
     if (!crosses || (plane >= slab.first && plane < slab.last)) {
-      add_plane<kChannels>(cell, stride_y, wx, wy, (1.F - wz) * share, value);
+      term.add(samples.lower[t] * scale, stride_y, cell);
     }
     if (!crosses || (plane + 1 >= slab.first && plane + 1 < slab.last)) {
-      add_plane<kChannels>(cell + kChannels * static_cast<std::ptrdiff_t>(stride_z), stride_y, wx, wy, wz * share,
-                           value);
+      term.add(samples.upper[t] * scale, stride_y, cell + kChannels * stride_z);
     }
   }
 }
@@ -306,7 +308,7 @@ void scatter(const Problem& problem, const float* slices, const std::vector<std:
                      ++pixels_per_plane[static_cast<std::size_t>((planes[0] + planes[1]) / 2)];
                    });
   }
-  const std::vector<Slab> slabs = balanced_slabs(pixels_per_plane, thread_count());
+  const std::vector<Slab> slabs = balanced_slabs(pixels_per_plane, worker_count());
   parallel_chunks(static_cast<std::int64_t>(slabs.size()), [&](std::int64_t first_slab, std::int64_t last_slab) {
     TapSamples samples(problem.largest_psf);
     for (std::int64_t s = first_slab; s < last_slab; ++s) {

@@ -12,6 +12,32 @@ constexpr float kMargin = 0.01F;
 // Taps apart in the list that may be added to at the same time; a prime, so that it divides no row of taps.
 constexpr std::size_t kSpread = 37;
 
+// Cell and position within it along one axis, for positions that are not negative: truncation is floor(). Plain arrays
+// that do not overlap, so that the compiler vectorises the loop.
+void locate_along(float centre, const float* __restrict__ from_x, const float* __restrict__ from_y,
+                  const float* __restrict__ from_z, std::size_t count, std::int32_t* __restrict__ cell,
+                  float* __restrict__ within) {
+  for (std::size_t t = 0; t < count; ++t) {
+    const float position = centre + from_x[t] + from_y[t] + from_z[t];
+    cell[t] = static_cast<std::int32_t>(position);
+    within[t] = position - static_cast<float>(cell[t]);
+  }
+}
+
+// Array offsets, and the PSF values split between the two planes of each cell; `upper` holds the position along z
+// before.
+void combine_axes(const VolumeShape& shape, const float* __restrict__ value, std::size_t count,
+                  const std::int32_t* __restrict__ x, const std::int32_t* __restrict__ y,
+                  const std::int32_t* __restrict__ z, std::int32_t* __restrict__ index, float* __restrict__ lower,
+                  float* __restrict__ upper) {
+  const std::int32_t stride_y = shape.stride_y(), stride_z = shape.stride_z();
+  for (std::size_t t = 0; t < count; ++t) {
+    index[t] = z[t] * stride_z + y[t] * stride_y + x[t];
+    lower[t] = (1.F - upper[t]) * value[t];
+    upper[t] = upper[t] * value[t];
+  }
+}
+
 }  // namespace
 
 PsfTaps nonzero_taps(const float* psf, const std::array<std::int64_t, 3>& size) {
@@ -102,6 +128,7 @@ void SliceTaps::place(const std::array<float, 3>& centre, TapSamples* samples) c
   switch (reach(centre)) {
     case Reach::kOutside:
       samples->count = 0;
+      samples->weight = 0.F;
       return;
     case Reach::kInterior:
       place_interior(centre, samples);
@@ -113,44 +140,34 @@ void SliceTaps::place(const std::array<float, 3>& centre, TapSamples* samples) c
 }
 
 void SliceTaps::place_interior(const std::array<float, 3>& centre, TapSamples* samples) const {
-  const std::size_t count = taps_.count();
-  const std::int32_t stride_y = shape_.stride_y(), stride_z = shape_.stride_z();
-  const float *xx = term_[0].data(), *xy = term_[1].data(), *xz = term_[2].data();
-  const float *yx = term_[3].data(), *yy = term_[4].data(), *yz = term_[5].data();
-  const float *zx = term_[6].data(), *zy = term_[7].data(), *zz = term_[8].data();
-  std::int32_t* __restrict__ index = samples->index.data();
-  float* __restrict__ wx = samples->wx.data();
-  float* __restrict__ wy = samples->wy.data();
-  float* __restrict__ wz = samples->wz.data();
-  const float cx = centre[0], cy = centre[1], cz = centre[2];
-  for (std::size_t t = 0; t < count; ++t) {
-    const float x = cx + xx[t] + xy[t] + xz[t];
-    const float y = cy + yx[t] + yy[t] + yz[t];
-    const float z = cz + zx[t] + zy[t] + zz[t];
-    // Positions are positive here, so truncation is floor().
-    const auto ix = static_cast<std::int32_t>(x), iy = static_cast<std::int32_t>(y), iz = static_cast<std::int32_t>(z);
-    index[t] = iz * stride_z + iy * stride_y + ix;
-    wx[t] = x - static_cast<float>(ix);
-    wy[t] = y - static_cast<float>(iy);
-    wz[t] = z - static_cast<float>(iz);
-  }
-  std::copy(taps_.value.begin(), taps_.value.end(), samples->value.begin());
-  samples->count = count;
+  locate_along(centre[0], term_[0].data(), term_[1].data(), term_[2].data(), taps_.count(), samples->cell_x.data(),
+               samples->wx.data());
+  locate_along(centre[1], term_[3].data(), term_[4].data(), term_[5].data(), taps_.count(), samples->cell_y.data(),
+               samples->wy.data());
+  locate_along(centre[2], term_[6].data(), term_[7].data(), term_[8].data(), taps_.count(), samples->cell_z.data(),
+               samples->upper.data());
+  combine_axes(shape_, taps_.value.data(), taps_.count(), samples->cell_x.data(), samples->cell_y.data(),
+               samples->cell_z.data(), samples->index.data(), samples->lower.data(), samples->upper.data());
+  samples->count = taps_.count();
+  samples->weight = total_;
 }
 
 void SliceTaps::place_rim(const std::array<float, 3>& centre, TapSamples* samples) const {
   std::size_t kept = 0;
+  samples->weight = 0.F;
   for (std::size_t t = 0; t < taps_.count(); ++t) {
     const float x = centre[0] + term_[0][t] + term_[1][t] + term_[2][t];
     const float y = centre[1] + term_[3][t] + term_[4][t] + term_[5][t];
     const float z = centre[2] + term_[6][t] + term_[7][t] + term_[8][t];
     if (!contains(x, y, z)) continue;
     const auto ix = static_cast<std::int32_t>(x), iy = static_cast<std::int32_t>(y), iz = static_cast<std::int32_t>(z);
-    samples->value[kept] = taps_.value[t];
     samples->index[kept] = iz * shape_.stride_z() + iy * shape_.stride_y() + ix;
     samples->wx[kept] = x - static_cast<float>(ix);
     samples->wy[kept] = y - static_cast<float>(iy);
-    samples->wz[kept] = z - static_cast<float>(iz);
+    const float wz = z - static_cast<float>(iz);
+    samples->lower[kept] = (1.F - wz) * taps_.value[t];
+    samples->upper[kept] = wz * taps_.value[t];
+    samples->weight += taps_.value[t];
     ++kept;
   }
   samples->count = kept;

@@ -30,15 +30,24 @@ PsfTaps nonzero_taps(const float* psf, const std::array<std::int64_t, 3>& size);
 /// voxels would wait for one another.
 PsfTaps spread_taps(const PsfTaps& taps);
 
-/// Where the taps of one pixel fall in the volume.
+/// Where the taps of one pixel fall in the volume. A tap's cell is the 2 x 2 x 2 voxels around it.
 struct TapSamples {
   explicit TapSamples(std::size_t capacity)
-      : value(capacity), index(capacity), wx(capacity), wy(capacity), wz(capacity) {}
+      : index(capacity),
+        wx(capacity),
+        wy(capacity),
+        lower(capacity),
+        upper(capacity),
+        cell_x(capacity),
+        cell_y(capacity),
+        cell_z(capacity) {}
 
   std::size_t count = 0;
-  std::vector<float> value;         ///< PSF value
-  std::vector<std::int32_t> index;  ///< array offset of the lower corner of the tap's cell
-  std::vector<float> wx, wy, wz;    ///< position within the cell, [0, 1)
+  float weight = 0.F;               ///< sum of the PSF values
+  std::vector<std::int32_t> index;  ///< array offset of the cell's first voxel
+  std::vector<float> wx, wy;        ///< position within the cell, [0, 1)
+  std::vector<float> lower, upper;  ///< PSF value times the share of the cell's lower and upper z plane
+  std::vector<std::int32_t> cell_x, cell_y, cell_z;  ///< working space
 };
 
 /// Taps of one slice, rotated once and placed at one pixel after the other.
