@@ -19,6 +19,8 @@ using Seconds = std::chrono::duration<double>;
 
 constexpr std::chrono::milliseconds kTick{2};        // how often callbacks are looked after while waiting
 constexpr std::chrono::milliseconds kClockTick{20};  // /clock between two slices
+constexpr std::chrono::milliseconds kSettle{200};    // a connection that is there may still be shaking hands
+constexpr std::chrono::seconds kWaitForAnswerer{2};
 
 StackPlayerOptions load(const ros::NodeHandle& private_nh) {
   StackPlayerOptions options;
@@ -66,12 +68,23 @@ void StackPlayer::publish_clock(const ros::Time& time) {
 
 bool StackPlayer::wait_for_subscribers() {
   const auto started = Clock::now();
+  std::optional<Clock::time_point> subscribed;
   bool warned = false;
   while (ros::ok()) {
-    const bool someone_answers = status_subscriber_.getNumPublishers() > 0 || options_.realtime > 0.;
-    if (publisher_.getNumSubscribers() > 0 && someone_answers) return true;
-    if (!warned && Clock::now() - started > Seconds(options_.timeout_s)) {
-      ROS_WARN("nobody has subscribed to %s for %.1f s; waiting on", publisher_.getTopic().c_str(), options_.timeout_s);
+    const auto now = Clock::now();
+    if (publisher_.getNumSubscribers() == 0)
+      subscribed.reset();
+    else if (!subscribed)
+      subscribed = now;
+    // Whoever answers does so on another connection, which must be there for the first answer. At the scanner's pace
+    // nobody needs to answer (a recorder does not), so that wait is short then.
+    const bool someone_answers = status_subscriber_.getNumPublishers() > 0;
+    const bool answer_is_needed = options_.realtime <= 0.;
+    if (subscribed && someone_answers && now - *subscribed > kSettle) return true;
+    if (subscribed && !answer_is_needed && now - *subscribed > kWaitForAnswerer) return true;
+    if (!warned && now - started > Seconds(options_.timeout_s)) {
+      ROS_WARN("nobody has subscribed to %s%s for %.1f s; waiting on", publisher_.getTopic().c_str(),
+               subscribed ? " and answers" : "", options_.timeout_s);
       warned = true;
     }
     publish_clock(slices_.front().header.stamp);  // a node with simulated time starts only when there is one

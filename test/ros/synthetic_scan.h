@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "svort_ros/acquisition/slice.h"
+#include "svort_ros/io/nifti.h"
 
 namespace svort_test {
 
@@ -84,6 +85,31 @@ inline std::vector<svort::Slice> synthetic_scan(const SyntheticScanOptions& opti
     }
   }
   return scan;
+}
+
+/// The values of one stack of the phantom as a NIfTI file.
+inline void write_stack(const std::filesystem::path& path, const std::vector<svort::Slice>& scan, int stack,
+                        bool mask) {
+  svort::Volume volume;
+  svort::Pose first = svort::Pose::Identity();
+  svort::Pose last = svort::Pose::Identity();
+  int count = 0;
+  for (const svort::Slice& slice : scan) {
+    if (slice.info.stack != stack) continue;
+    if (slice.info.index == 0) first = slice.info.T_scanner_slice;
+    if (slice.info.index == slice.info.slices_in_stack - 1) last = slice.info.T_scanner_slice;
+    volume.grid.size = {slice.info.columns, slice.info.rows, slice.info.slices_in_stack};
+    volume.grid.spacing = {slice.info.pixel_spacing.x(), slice.info.pixel_spacing.y(), slice.info.thickness};
+    volume.values.resize(volume.grid.voxel_count());
+    for (std::size_t i = 0; i < slice.pixels.size(); ++i)
+      volume.values[volume.grid.offset(0, 0, slice.info.index) + i] =
+          mask ? static_cast<float>(slice.mask[i]) : slice.pixels[i];
+    ++count;
+  }
+  if (count == 0 || count != volume.grid.size.z()) throw std::logic_error("write_stack: no whole stack");
+  volume.grid.T_frame_grid = first;
+  volume.grid.T_frame_grid.translation() = 0.5 * (first.translation() + last.translation());
+  svort::write_nifti(path, volume);
 }
 
 /// A new folder, removed with all that is in it.
