@@ -45,7 +45,8 @@ struct EstimatorOptions {
   double volume_size_mm = 128.0;      ///< edge of the cube that is reconstructed, centred on the brain frame
   double recentre_mm = 10.0;          ///< the brain frame moves only when its centre is off by more than this
   int cg_iterations = 0;              ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
-  int final_cg_iterations = 8;        ///< the same, in finalise()
+  /// The same, in finalise(). More sharpen the volume where poses are right, and fit noise and motion where not.
+  int final_cg_iterations = 2;
 
   template <class Visitor>
   void visit(Visitor&& v) {
