@@ -1,5 +1,5 @@
 #!/bin/bash
-# Starts rviz with the shipped view on the replayed scan and looks at the picture: it must show a brain.
+# Starts rviz with the shipped view on the replayed scan and looks at the picture: it must show a brain, axes, a slice.
 # usage: rviz_test.sh SOURCE_DIR BUILD_DIR
 set -euo pipefail
 source_dir=$1 build_dir=$2
@@ -11,14 +11,26 @@ trap 'rm -rf "$work"' EXIT
 picture=$work/picture.png
 scripts/render_readme_picture --build "$build_dir" --output "$picture"
 
-# The middle of the window, where the view looks at the origin of the brain frame.
-convert "$picture" -gravity center -crop 40%x50%+0+0 +repage "$work/middle.png"
-colours=$(identify -format %k "$work/middle.png")
-# Background is the dark colour of the view; what is lighter than it belongs to brain, slice or axes.
-lit=$(convert "$work/middle.png" -colorspace Gray -threshold 20% -format '%[fx:100*mean]' info:)
-# Axes and slice outline are the only saturated things: red, green and blue lines, orange frame.
-saturated=$(convert "$work/middle.png" -colorspace HSL -channel G -separate -threshold 80% -format '%[fx:10000*mean]' info:)
-printf 'middle of the picture: %s colours, %s %% lit, %s of 10000 pixels saturated\n' "$colours" "$lit" "$saturated"
-((colours > 500)) || fail "the picture has only $colours colours in its middle: no shaded surface"
-awk -v v="$lit" 'BEGIN {exit !(v > 15)}' || fail "only $lit % of the picture's middle is lit: no brain"
-awk -v v="$saturated" 'BEGIN {exit !(v > 2)}' || fail "the picture shows neither axes nor slice"
+# count CROP CONDITION: per cent of the pixels of which the condition on r, g, b (0 to 255) is true.
+count() {
+  convert "$picture" -gravity center -crop "$1" +repage -depth 8 -alpha off ppm:- |
+    "$PYTHON" -c '
+import sys
+data = sys.stdin.buffer.read()
+pixels = data[data.index(b"\n255\n") + 5:]
+hits = sum(1 for r, g, b in zip(pixels[0::3], pixels[1::3], pixels[2::3]) if eval(sys.argv[1]))
+print(f"{300 * hits / len(pixels):.3f}")' "$2"
+}
+at_least() {
+  echo "$1: $2 % of the pixels"
+  awk -v value="$2" -v least="$3" 'BEGIN {exit !(value >= least)}' || fail "$1: only $2 % of the pixels, expected $3 %"
+}
+
+# The middle, where the view looks at the origin of the brain frame; the background is dark blue (20, 24, 34).
+at_least "brain surface or slice in the middle" "$(count 30%x40%+0+0 'min(r, g, b) > 45')" 50
+at_least "blue axis" "$(count 100%x100%+0+0 'b > 120 and r < 80 and g < 80')" 0.01
+at_least "red axis" "$(count 100%x100%+0+0 'r > 120 and g < 80 and b < 80')" 0.01
+at_least "orange frame of the current slice" "$(count 100%x100%+0+0 'r > 200 and 120 < g < 220 and b < 90')" 0.02
+colours=$(convert "$picture" -gravity center -crop 30%x40%+0+0 +repage -format %k info:)
+echo "colours in the middle: $colours"
+((colours > 300)) || fail "the picture has only $colours colours in its middle: nothing is shaded"
