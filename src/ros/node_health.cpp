@@ -37,7 +37,8 @@ NodeHealth::NodeHealth(const ros::NodeHandle& nh, const ros::NodeHandle& private
   updater_.add("slices", this, &NodeHealth::report_slices);
   updater_.add("estimator", this, &NodeHealth::report_estimator);
   updater_.add("results", this, &NodeHealth::report_results);
-  timer_ = nh.createTimer(ros::Duration(1.), [this](const ros::TimerEvent&) { updater_.force_update(); });
+  timer_ =
+      nh.createTimer(ros::Duration(updater_.getPeriod()), [this](const ros::TimerEvent&) { updater_.force_update(); });
 }
 
 void NodeHealth::set_estimator(Estimator estimator) {

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
 #include <stdexcept>
 #include <thread>
 
@@ -165,6 +166,7 @@ int StackPlayer::run() {
 }
 
 int run_stack_player(int argc, char** argv) {
+  setvbuf(stdout, nullptr, _IOLBF, 0);  // a progress line must be seen at once in a pipe, too
   ros::init(argc, argv, "stack_player");
   try {
     return StackPlayer(ros::NodeHandle(), ros::NodeHandle("~")).run();

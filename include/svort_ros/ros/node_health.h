@@ -17,8 +17,8 @@
 
 namespace svort_ros {
 
-/// Counts what the node does and reports it on /diagnostics once per second (of ROS time). All members may be called
-/// from any thread; the worker is held up for no longer than a few numbers take to copy.
+/// Counts what the node does and reports it on /diagnostics once per second of ROS time (~diagnostic_period). All
+/// members may be called from any thread; the worker is held up for no longer than a few numbers take to copy.
 class NodeHealth {
  public:
   struct Estimator {
