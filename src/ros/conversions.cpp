@@ -486,13 +486,20 @@ visualization_msgs::Marker make_marker(const std_msgs::Header& header, const std
   return marker;
 }
 
-visualization_msgs::Marker outline_marker(const svort::SliceEstimate& slice, const std_msgs::Header& header) {
+/// Frame around the field that was cut out of the slice; around the whole slice if there is no image.
+visualization_msgs::Marker outline_marker(const svort::SliceEstimate& slice, const SliceImage& image,
+                                          const std_msgs::Header& header) {
   visualization_msgs::Marker marker = make_marker(header, "outline", visualization_msgs::Marker::LINE_STRIP, 0.7);
   marker.color = colour(1.F, 0.75F, 0.1F);
-  const Eigen::Vector2d half =
+  svort::Pose T_brain_frame = slice.T_brain_slice;
+  Eigen::Vector2d half =
       0.5 * slice.info.pixel_spacing.cwiseProduct(Eigen::Vector2d(slice.info.columns, slice.info.rows));
+  if (image.slice) {
+    T_brain_frame = T_brain_frame * image.slice->T_slice_crop;
+    half.setConstant(0.5 * image.slice->size * image.slice->resolution);
+  }
   for (const auto& [x, y] : {std::pair{-1, -1}, {1, -1}, {1, 1}, {-1, 1}, {-1, -1}})
-    marker.points.push_back(to_point_msg(slice.T_brain_slice * Eigen::Vector3d(x * half.x(), y * half.y(), 0.)));
+    marker.points.push_back(to_point_msg(T_brain_frame * Eigen::Vector3d(x * half.x(), y * half.y(), 0.)));
   return marker;
 }
 
@@ -542,7 +549,7 @@ visualization_msgs::Marker plane_marker(const svort::SliceEstimate& slice, const
 visualization_msgs::MarkerArray to_slice_markers(const svort::SliceEstimate& slice, const SliceImage& image,
                                                  const std_msgs::Header& header) {
   visualization_msgs::MarkerArray markers;
-  markers.markers.push_back(outline_marker(slice, header));
+  markers.markers.push_back(outline_marker(slice, image, header));
   markers.markers.push_back(axes_marker(slice, header));
   if (image.slice) markers.markers.push_back(plane_marker(slice, image, header));
   return markers;

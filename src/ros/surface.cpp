@@ -22,7 +22,7 @@ visualization_msgs::Marker to_surface(const svort::Volume& volume, double thresh
   marker.color.r = 0.85F;
   marker.color.g = 0.70F;
   marker.color.b = 0.65F;
-  marker.color.a = 1.F;
+  marker.color.a = 0.45F;  // the current slice lies inside and must show
 
   const double level = threshold * reference_intensity(volume);
   if (level > 0.) {

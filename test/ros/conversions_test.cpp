@@ -431,14 +431,18 @@ TEST(SliceMarkers, OutlineAndPlaneLieInTheSlice) {
   const auto in_slice = [&](const geometry_msgs::Point& p) -> Eigen::Vector3d {
     return some_pose().inverse() * (1000. * Eigen::Vector3d(p.x, p.y, p.z));
   };
-  EXPECT_TRUE(in_slice(markers[0].points[0]).isApprox(Eigen::Vector3d(-48., -48., 0.), 1e-9));
-  EXPECT_TRUE(in_slice(markers[0].points[2]).isApprox(Eigen::Vector3d(48., 48., 0.), 1e-9));
+  EXPECT_TRUE(in_slice(markers[0].points[0]).isApprox(Eigen::Vector3d(1., -7., 0.), 1e-9));  // 8 mm around (5, -3)
+  EXPECT_TRUE(in_slice(markers[0].points[2]).isApprox(Eigen::Vector3d(9., 1., 0.), 1e-9));
   EXPECT_TRUE(in_slice(markers[1].points[5]).isApprox(Eigen::Vector3d(0., 0., 20.), 1e-9));  // z axis
   ASSERT_EQ(markers[2].points.size(), 6U);  // the one block of four brain pixels
   EXPECT_TRUE(in_slice(markers[2].points[0]).isApprox(Eigen::Vector3d(4., -4., 0.), 1e-9));  // pixel (1, 1)
   EXPECT_FLOAT_EQ(markers[2].colors[0].r, 0.25F);
   EXPECT_FLOAT_EQ(markers[2].colors[2].r, 1.F);  // 90 / 40, clipped
-  EXPECT_EQ(to_slice_markers(slice, {}, std_msgs::Header()).markers.size(), 2U);
+
+  const auto without_image = to_slice_markers(slice, {}, std_msgs::Header()).markers;
+  ASSERT_EQ(without_image.size(), 2U);
+  EXPECT_TRUE(in_slice(without_image[0].points[0]).isApprox(Eigen::Vector3d(-48., -48., 0.), 1e-9));
+  EXPECT_TRUE(in_slice(without_image[0].points[2]).isApprox(Eigen::Vector3d(48., 48., 0.), 1e-9));
 }
 
 TEST(SliceFrame, NamesStackAndIndex) { EXPECT_EQ(slice_frame(some_slice().info), "slice_0_6"); }
