@@ -37,7 +37,8 @@ configure_and_build() {
   shift 2
   mkdir -p "$folder"
   say "Configure $folder"
-  cmake -S . -B "$folder" -G Ninja -DPYTHON_EXECUTABLE=$PYTHON -DPython3_EXECUTABLE=$PYTHON "$@" >"$folder.log" 2>&1 || {
+  cmake -S . -B "$folder" -G Ninja -DPYTHON_EXECUTABLE=$PYTHON -DPython3_EXECUTABLE=$PYTHON \
+    -DCMAKE_INSTALL_PREFIX="$ROOT/install" "$@" >"$folder.log" 2>&1 || {
     cat "$folder.log" >&2
     fail "cmake failed; its output is above and in $folder.log"
   }

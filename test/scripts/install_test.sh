@@ -8,8 +8,9 @@ source "$source_dir/scripts/common.sh"
 
 work="$(mktemp -d)"
 trap 'stop_all; rm -rf "$work"' EXIT
-prefix=$work/prefix
-cmake --install "$build_dir" --prefix "$prefix" >"$work/install.log" || {
+# catkin fixes the prefix when it configures; DESTDIR puts a folder of our own before it.
+prefix=$work$(sed -n 's/^CMAKE_INSTALL_PREFIX:PATH=//p' "$build_dir/CMakeCache.txt")
+DESTDIR=$work cmake --install "$build_dir" >"$work/install.log" || {
   cat "$work/install.log"
   fail "cmake --install failed"
 }
