@@ -6,13 +6,13 @@ source_dir=$1 build_dir=$2
 # shellcheck source=../../scripts/common.sh
 source "$source_dir/scripts/common.sh"
 
-# The workspace lies elsewhere: a link to the package inside the package would be a loop for programs that follow links.
-# The build folder lies beside the other one, so that ccache sees the same relative paths and knows the objects.
-workspace="$(mktemp -d)"
-trap 'rm -rf "$workspace"' EXIT
+# Beside the other build and with the same relative paths, so that ccache knows the objects. The link to the package
+# inside the package is a loop for programs that follow links: it must not stay.
 catkin_build=$build_dir-catkin
+workspace=$catkin_build/workspace
 rm -rf "$catkin_build"
 mkdir -p "$workspace/src"
+trap 'rm -f "$workspace/src/svort_ros"' EXIT
 ln -s "$source_dir" "$workspace/src/svort_ros"
 unset CMAKE_PREFIX_PATH ROS_PACKAGE_PATH LD_LIBRARY_PATH PYTHONPATH
 catkin_make -C "$workspace" --build "$catkin_build" --use-ninja -j "$(build_jobs)" -DSVORT_BUILD_TESTS=OFF \
@@ -21,4 +21,5 @@ catkin_make -C "$workspace" --build "$catkin_build" --use-ninja -j "$(build_jobs
 source_setup "$catkin_build/devel/setup.bash"
 [[ "$(readlink -f "$(rospack find svort_ros)")" == "$(readlink -f "$source_dir")" ]] ||
   fail "rospack finds $(rospack find svort_ros)"
-rosrun svort_ros svort_replay --help | grep -q -- --output || fail "svort_replay --help does not mention --output"
+"$catkin_build/devel/lib/svort_ros/svort_replay" --help | grep -q -- --output ||
+  fail "svort_replay --help does not mention --output"
