@@ -12,7 +12,9 @@ function(svort_target_options target)
     target_compile_options(${target} PRIVATE -Werror)
   endif()
   if(SVORT_SANITIZE)
-    target_compile_options(${target} PRIVATE -fsanitize=${SVORT_SANITIZE} -fno-omit-frame-pointer)
+    # GCC 12 takes an instrumented std::optional for uninitialised.
+    target_compile_options(${target} PRIVATE -fsanitize=${SVORT_SANITIZE} -fno-omit-frame-pointer
+                                             -Wno-maybe-uninitialized)
     target_link_options(${target} PRIVATE -fsanitize=${SVORT_SANITIZE})
   endif()
 endfunction()
