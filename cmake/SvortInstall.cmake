@@ -8,10 +8,14 @@ if(SVORT_WITH_ROS)
   set(svort_lib_dir ${CATKIN_PACKAGE_LIB_DESTINATION})
   set(svort_include_dir ${CATKIN_GLOBAL_INCLUDE_DESTINATION})
   set(svort_share_dir ${CATKIN_PACKAGE_SHARE_DESTINATION})
+  set(svort_bin_dir ${CATKIN_PACKAGE_BIN_DESTINATION})
+  set(svort_libraries_from_bin ..)
 else()
   set(svort_lib_dir ${CMAKE_INSTALL_LIBDIR})
   set(svort_include_dir ${CMAKE_INSTALL_INCLUDEDIR})
   set(svort_share_dir ${CMAKE_INSTALL_DATADIR}/svort_ros)
+  set(svort_bin_dir ${CMAKE_INSTALL_BINDIR})
+  set(svort_libraries_from_bin ../${CMAKE_INSTALL_LIBDIR})
 endif()
 
 # Every library and program of this project finds its libraries relative to itself: the prefix can be moved.
@@ -22,7 +26,7 @@ set(svort_programs)
 foreach(target ${svort_targets})
   get_target_property(type ${target} TYPE)
   if(type STREQUAL "EXECUTABLE")
-    set_target_properties(${target} PROPERTIES INSTALL_RPATH "$ORIGIN/..")
+    set_target_properties(${target} PROPERTIES INSTALL_RPATH "$ORIGIN/${svort_libraries_from_bin}")
     list(APPEND svort_programs ${target})
   elseif(type STREQUAL "SHARED_LIBRARY")
     set_target_properties(${target} PROPERTIES INSTALL_RPATH "$ORIGIN")
@@ -42,6 +46,7 @@ install(DIRECTORY include/svort_ros DESTINATION ${svort_include_dir}
   FILES_MATCHING PATTERN "*.h"
   PATTERN io EXCLUDE
   PATTERN ros EXCLUDE)
+install(TARGETS ${svort_programs} RUNTIME DESTINATION ${svort_bin_dir})
 install(FILES LICENSE DESTINATION ${svort_share_dir})
 
 set(svort_core_config_dir ${svort_lib_dir}/cmake/svort_core)
@@ -56,7 +61,6 @@ if(SVORT_WITH_ROS)
   install(TARGETS ${svort_other_libraries}
     LIBRARY DESTINATION ${svort_lib_dir}
     ARCHIVE DESTINATION ${svort_lib_dir})
-  install(TARGETS ${svort_programs} RUNTIME DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})
   install(DIRECTORY include/svort_ros/io include/svort_ros/ros DESTINATION ${svort_include_dir}/svort_ros
     FILES_MATCHING PATTERN "*.h")
   install(FILES nodelet_plugins.xml DESTINATION ${svort_share_dir})

@@ -46,9 +46,18 @@ double masked_correlation(const float* a, const float* b, const bool* mask, cons
   return (n * sum_ab - sum_a * sum_b) / std::sqrt(variance);
 }
 
+AcquisitionFormulation formulation_of(const EstimatorOptions& options) {
+  try {
+    return acquisition_formulation(options.formulation);
+  } catch (const std::invalid_argument& error) {
+    throw std::invalid_argument(std::string("estimator.formulation: ") + error.what());
+  }
+}
+
 }  // namespace
 
-NominalEstimator::NominalEstimator(const EstimatorOptions& options) : options_(options) {
+NominalEstimator::NominalEstimator(const EstimatorOptions& options)
+    : options_(options), formulation_(formulation_of(options)) {
   require(options.volume_resolution_mm >= 0.2 && options.volume_resolution_mm <= 10., "volume_resolution_mm",
           options.volume_resolution_mm, "from 0.2 to 10 mm");
   require(options.volume_size_mm >= 4. * options.volume_resolution_mm && options.volume_size_mm <= 400.,
@@ -113,18 +122,19 @@ void NominalEstimator::reset() {
 void NominalEstimator::estimate_volume(const SliceSequence& sequence, int cg_iterations) {
   const torch::NoGradGuard no_grad;
   const SliceBatch batch = make_slice_batch(sequence, estimate_.slices, grid_);
-  torch::Tensor volume =
-      reconstruct_psf(batch.pixels, batch.geometry, {grid_.size.z(), grid_.size.y(), grid_.size.x()}, batch.masks);
+  const auto height = static_cast<int>(batch.pixels.size(2));
+  const auto width = static_cast<int>(batch.pixels.size(3));
+  const SliceAcquisition acquisition(batch.geometry, height, width, {grid_.size.z(), grid_.size.y(), grid_.size.x()},
+                                     formulation_, batch.masks);
+  torch::Tensor volume = reconstruct_psf(batch.pixels, acquisition);
   if (cg_iterations > 0) {
     ConjugateGradientOptions options;
     options.iterations = cg_iterations;
-    volume = solve_weighted_inverse(batch.pixels, batch.geometry, batch.weights, volume, options, batch.masks);
+    volume = solve_weighted_inverse(batch.pixels, acquisition, batch.weights, volume, options);
   }
 
-  const auto height = static_cast<int>(batch.pixels.size(2));
-  const auto width = static_cast<int>(batch.pixels.size(3));
   torch::Tensor coverage;
-  const torch::Tensor simulated = acquire_slices(volume, batch.geometry, height, width, batch.masks, &coverage);
+  const torch::Tensor simulated = acquisition.forward(volume, &coverage);
   const auto plane = static_cast<std::size_t>(height) * static_cast<std::size_t>(width);
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i)
     estimate_.slices[i].ncc = masked_correlation(

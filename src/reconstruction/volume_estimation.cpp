@@ -30,87 +30,71 @@ torch::Tensor weighted(const torch::Tensor& slices, const torch::Tensor& weights
   return weights.defined() ? slices * weights : slices;
 }
 
-void check_start(const torch::Tensor& start, const char* function) {
-  if (!start.defined() || start.dim() != 3 || start.scalar_type() != torch::kFloat32 || !start.device().is_cpu()) {
-    throw std::invalid_argument(std::string(function) + ": start must be D x H x W, float32, on the CPU");
+void check_start(const torch::Tensor& start, const SliceAcquisition& acquisition, const char* function) {
+  const std::array<std::int64_t, 3> shape = acquisition.volume_shape();
+  if (!start.defined() || start.sizes() != torch::IntArrayRef(shape) || start.scalar_type() != torch::kFloat32 ||
+      !start.device().is_cpu()) {
+    throw std::invalid_argument(std::string(function) + ": start must be " + std::to_string(shape[0]) + " x " +
+                                std::to_string(shape[1]) + " x " + std::to_string(shape[2]) +
+                                ", float32, on the CPU, as the operator's volume");
   }
 }
 
-void check_slices(const torch::Tensor& slices, const AcquisitionGeometry& geometry, const char* function) {
-  if (!slices.defined() || slices.dim() != 4 || slices.size(1) != 1 || slices.scalar_type() != torch::kFloat32 ||
-      !slices.device().is_cpu() || !geometry.transforms.defined() || geometry.transforms.dim() != 3 ||
-      geometry.transforms.size(0) != slices.size(0)) {
-    throw std::invalid_argument(std::string(function) +
-                                ": slices must be n x 1 x h x w, float32, on the CPU, with n transforms");
+void check_slices(const torch::Tensor& slices, const SliceAcquisition& acquisition, const char* function) {
+  const std::array<std::int64_t, 4> shape = {acquisition.slice_count(), 1, acquisition.height(), acquisition.width()};
+  if (!slices.defined() || slices.sizes() != torch::IntArrayRef(shape) || slices.scalar_type() != torch::kFloat32 ||
+      !slices.device().is_cpu()) {
+    throw std::invalid_argument(std::string(function) + ": slices must be " + std::to_string(shape[0]) + " x 1 x " +
+                                std::to_string(shape[2]) + " x " + std::to_string(shape[3]) +
+                                ", float32, on the CPU, as the operator's slices");
   }
 }
 
-std::array<std::int64_t, 3> shape_of(const torch::Tensor& volume) {
-  return {volume.size(0), volume.size(1), volume.size(2)};
-}
-
-// A slice pixel outside the mask takes no part, whatever its value.
-torch::Tensor normal_operator(const torch::Tensor& volume, const AcquisitionGeometry& geometry, std::int64_t height,
-                              std::int64_t width, const torch::Tensor& weights, const AcquisitionMasks& masks) {
-  const torch::Tensor simulated =
-      acquire_slices(volume, geometry, static_cast<int>(height), static_cast<int>(width), masks);
-  return scatter_slices(weighted(simulated, weights), geometry, shape_of(volume), /*equalize=*/false, masks);
+// The weights, contiguous, or undefined.
+torch::Tensor flat(const torch::Tensor& weights) {
+  return weights.defined() ? weights.reshape({-1}).contiguous() : weights;
 }
 
 }  // namespace
 
-torch::Tensor reconstruct_psf(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
-                              const std::array<std::int64_t, 3>& volume_shape, const AcquisitionMasks& masks) {
-  return scatter_slices(slices, geometry, volume_shape, /*equalize=*/true, masks);
+torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition) {
+  return acquisition.adjoint(slices, /*equalize=*/true);
 }
 
-torch::Tensor apply_normal_operator(const torch::Tensor& volume, const AcquisitionGeometry& geometry, int height,
-                                    int width, const torch::Tensor& weights, const AcquisitionMasks& masks) {
-  const char* function = "apply_normal_operator";
-  check_start(volume, function);
-  const std::int64_t slices =
-      geometry.transforms.defined() && geometry.transforms.dim() > 0 ? geometry.transforms.size(0) : 0;
-  return normal_operator(volume, geometry, height, width, checked_weights(weights, slices, function), masks);
-}
-
-torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
-                                     const ConjugateGradientOptions& options, const AcquisitionMasks& masks,
-                                     ConjugateGradientReport* report) {
+                                     const ConjugateGradientOptions& options, ConjugateGradientReport* report) {
   const char* function = "solve_weighted_inverse";
   if (options.iterations < 0 || !std::isfinite(options.tolerance) || options.tolerance < 0.) {
     throw std::invalid_argument(std::string(function) + ": iterations and tolerance must not be negative, got " +
                                 std::to_string(options.iterations) + " and " + std::to_string(options.tolerance));
   }
-  check_start(start, function);
-  check_slices(slices, geometry, function);
+  check_start(start, acquisition, function);
+  check_slices(slices, acquisition, function);
   const torch::Tensor w = checked_weights(weights, slices.size(0), function);
+  const torch::NoGradGuard no_grad;
   // A^T W A x = A^T W y
-  const torch::Tensor b =
-      scatter_slices(weighted(slices.detach(), w), geometry, shape_of(start), /*equalize=*/false, masks);
-  const auto apply = [&](const torch::Tensor& x) {
-    return normal_operator(x, geometry, slices.size(2), slices.size(3), w, masks);
-  };
+  const torch::Tensor b = acquisition.adjoint(weighted(slices, w), /*equalize=*/false);
+  const auto apply = [&, of_slices = flat(w)](const torch::Tensor& x) { return acquisition.normal(x, of_slices); };
   return conjugate_gradient(apply, b, start, options, report).clamp_min_(0);
 }
 
-torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
-                                     const EdgePreservingOptions& options, const AcquisitionMasks& masks) {
+                                     const EdgePreservingOptions& options) {
   const char* function = "refine_edge_preserving";
   if (options.iterations < 0 || !(options.step > 0.) || !(options.strength >= 0.) || !(options.edge > 0.)) {
     throw std::invalid_argument(std::string(function) +
                                 ": iterations and strength must not be negative, step and edge must be positive");
   }
-  check_start(start, function);
-  check_slices(slices, geometry, function);
+  check_start(start, acquisition, function);
+  check_slices(slices, acquisition, function);
   const torch::Tensor w = checked_weights(weights, slices.size(0), function);
+  const torch::NoGradGuard no_grad;
   torch::Tensor x = start.detach().clone(torch::MemoryFormat::Contiguous);
   for (int i = 0; i < options.iterations; ++i) {
-    const torch::Tensor error =
-        acquire_slices(x, geometry, static_cast<int>(slices.size(2)), static_cast<int>(slices.size(3)), masks) -
-        slices.detach();
-    torch::Tensor gradient = scatter_slices(weighted(error, w), geometry, shape_of(x), /*equalize=*/false, masks);
+    const torch::Tensor error = acquisition.forward(x) - slices;
+    torch::Tensor gradient = acquisition.adjoint(weighted(error, w), /*equalize=*/false);
     add_edge_prior_gradient(x, options.edge, options.strength * options.edge * options.edge, &gradient);
     x.sub_(gradient * options.step);
   }

@@ -38,12 +38,12 @@ double inner_product(const torch::Tensor& a, const torch::Tensor& b) {
   return (a.to(torch::kFloat64) * b.to(torch::kFloat64)).sum().item<double>();
 }
 
-class SliceAcquisition : public testing::Test {
+class AcquisitionOperator : public testing::Test {
  protected:
   void SetUp() override { torch::manual_seed(7); }
 };
 
-TEST_F(SliceAcquisition, ConstantVolumeGivesTheConstantWhereCovered) {
+TEST_F(AcquisitionOperator, ConstantVolumeGivesTheConstantWhereCovered) {
   // Odd and even sizes, slices that stick out.
   for (const auto& shape : {std::array<std::int64_t, 3>{20, 23, 26}, {21, 20, 19}, {9, 40, 17}}) {
     const AcquisitionGeometry geometry = random_geometry(5, 4.);
@@ -60,7 +60,7 @@ TEST_F(SliceAcquisition, ConstantVolumeGivesTheConstantWhereCovered) {
   }
 }
 
-TEST_F(SliceAcquisition, LinearRampIsReproducedInTheInterior) {
+TEST_F(AcquisitionOperator, LinearRampIsReproducedInTheInterior) {
   // A symmetric PSF and trilinear interpolation leave a linear function as it is: positions are checked, with their
   // signs.
   const std::array<std::int64_t, 3> shape = {40, 44, 47};
@@ -82,7 +82,7 @@ TEST_F(SliceAcquisition, LinearRampIsReproducedInTheInterior) {
   EXPECT_LT((slices - expected).abs().max().item<float>(), 2e-3F);  // values reach 100; float32, sums of 1192 terms
 }
 
-TEST_F(SliceAcquisition, ScatterIsTheAdjoint) {
+TEST_F(AcquisitionOperator, ScatterIsTheAdjoint) {
   for (const double thickness : {1., 3.75}) {
     const AcquisitionGeometry geometry = random_geometry(9, 6., 1.25, thickness);
     const torch::Tensor volume = torch::rand({30, 33, 28});
@@ -99,7 +99,7 @@ TEST_F(SliceAcquisition, ScatterIsTheAdjoint) {
   }
 }
 
-TEST_F(SliceAcquisition, EqualizedScatterOfAConstantIsTheConstant) {
+TEST_F(AcquisitionOperator, EqualizedScatterOfAConstantIsTheConstant) {
   const AcquisitionGeometry geometry = random_geometry(6, 3.);
   const torch::Tensor ones = torch::full({6, 1, 20, 20}, 2.F);
   const torch::Tensor volume = scatter_slices(ones, geometry, {30, 30, 30}, /*equalize=*/true);
@@ -109,7 +109,7 @@ TEST_F(SliceAcquisition, EqualizedScatterOfAConstantIsTheConstant) {
   EXPECT_EQ(volume.index({~reached}).abs().sum().item<float>(), 0.F);
 }
 
-TEST_F(SliceAcquisition, MasksConfineBothDirections) {
+TEST_F(AcquisitionOperator, MasksConfineBothDirections) {
   const AcquisitionGeometry geometry = random_geometry(4, 3.);
   const torch::Tensor volume = torch::rand({24, 24, 24}) + 1;
   AcquisitionMasks masks;
@@ -133,7 +133,7 @@ TEST_F(SliceAcquisition, MasksConfineBothDirections) {
   EXPECT_GT(scattered.index({masks.volume}).sum().item<float>(), 0.F);
 }
 
-TEST_F(SliceAcquisition, SlicesOutsideAndNoSlices) {
+TEST_F(AcquisitionOperator, SlicesOutsideAndNoSlices) {
   AcquisitionGeometry geometry = random_geometry(2, 0.);
   geometry.transforms = geometry.transforms.clone();
   geometry.transforms.select(2, 3).fill_(500.F);
@@ -155,12 +155,12 @@ TEST_F(SliceAcquisition, SlicesOutsideAndNoSlices) {
             (std::vector<std::int64_t>{5, 6, 7}));
 }
 
-TEST_F(SliceAcquisition, VolumeOfOneVoxelHasNoCell) {
+TEST_F(AcquisitionOperator, VolumeOfOneVoxelHasNoCell) {
   const AcquisitionGeometry geometry = random_geometry(1, 0.);
   EXPECT_EQ(acquire_slices(torch::ones({1, 1, 1}), geometry, 5, 5).abs().sum().item<float>(), 0.F);
 }
 
-TEST_F(SliceAcquisition, PointPsfSamplesTheVolume) {
+TEST_F(AcquisitionOperator, PointPsfSamplesTheVolume) {
   // One tap and the identity: pixels are voxels, shifted by half a voxel where sizes are even and odd.
   AcquisitionGeometry geometry;
   geometry.transforms = torch::eye(3, 4).unsqueeze(0);
@@ -174,7 +174,7 @@ TEST_F(SliceAcquisition, PointPsfSamplesTheVolume) {
   EXPECT_TRUE(torch::allclose(even[0][0], between, 0., 1e-6));
 }
 
-TEST_F(SliceAcquisition, EachSliceHasItsOwnPsf) {
+TEST_F(AcquisitionOperator, EachSliceHasItsOwnPsf) {
   AcquisitionGeometry several = random_geometry(4, 3.);
   const torch::Tensor thin = gaussian_psf({1.25, 1.25, 2.}), thick = gaussian_psf({1.25, 1.25, 5.});
   several.psf = stack_psfs({thin, thick});
@@ -198,7 +198,7 @@ TEST_F(SliceAcquisition, EachSliceHasItsOwnPsf) {
   EXPECT_THROW(acquire_slices(volume, several, 20, 22), std::invalid_argument);
 }
 
-TEST_F(SliceAcquisition, SameBytesForAnyThreadCount) {
+TEST_F(AcquisitionOperator, SameBytesForAnyThreadCount) {
   const AcquisitionGeometry geometry = random_geometry(12, 8.);
   const torch::Tensor volume = torch::rand({40, 36, 38});
   AcquisitionMasks masks;
@@ -219,7 +219,7 @@ TEST_F(SliceAcquisition, SameBytesForAnyThreadCount) {
   }
 }
 
-TEST_F(SliceAcquisition, AcceptsStridedInput) {
+TEST_F(AcquisitionOperator, AcceptsStridedInput) {
   AcquisitionGeometry geometry = random_geometry(3, 2.);
   const torch::Tensor volume = torch::rand({20, 22, 24});
   const torch::Tensor expected = acquire_slices(volume, geometry, 16, 18);
@@ -229,7 +229,7 @@ TEST_F(SliceAcquisition, AcceptsStridedInput) {
   EXPECT_TRUE(torch::equal(acquire_slices(transposed, geometry, 16, 18), expected));
 }
 
-TEST_F(SliceAcquisition, RejectsWhatDoesNotFit) {
+TEST_F(AcquisitionOperator, RejectsWhatDoesNotFit) {
   const AcquisitionGeometry good = random_geometry(2, 1.);
   const torch::Tensor volume = torch::rand({12, 12, 12});
   const auto message_of = [&](const std::function<void()>& call) -> std::string {

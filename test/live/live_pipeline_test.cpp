@@ -193,6 +193,12 @@ TEST(MakeEstimator, NamesTheOptionThatIsWrong) {
   options.method = "magic";
   EXPECT_NE(message(options).find("'magic'"), std::string::npos);
   options = {};
+  options.formulation = "quick";
+  EXPECT_NE(message(options).find("estimator.formulation"), std::string::npos);
+  EXPECT_NE(message(options).find("'quick'"), std::string::npos);
+  options.formulation = "exact";
+  EXPECT_EQ(message(options), "accepted");
+  options = {};
   options.volume_resolution_mm = 0.;
   EXPECT_NE(message(options).find("volume_resolution_mm"), std::string::npos);
   options = {};

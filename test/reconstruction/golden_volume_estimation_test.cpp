@@ -25,9 +25,13 @@ TEST(GoldenVolumeEstimation, MatchesThePublicImplementation) {
     l2.check(d.relative_l2, key);
     maximum.check(d.maximum, key);
   };
-  check(reconstruct_psf(slices, geometry, shape), "x0");
-  check(scatter_slices(slices * weights.view({-1, 1, 1, 1}), geometry, shape, /*equalize=*/false), "b");
-  check(apply_normal_operator(start, geometry, height, width, weights), "AtA_x0");
+  const auto operator_with = [&](const AcquisitionMasks& masks) {
+    return SliceAcquisition(geometry, height, width, shape, AcquisitionFormulation::exact, masks);
+  };
+  const SliceAcquisition all = operator_with({});
+  check(reconstruct_psf(slices, all), "x0");
+  check(all.adjoint(slices * weights.view({-1, 1, 1, 1}), /*equalize=*/false), "b");
+  check(all.normal(start, weights), "AtA_x0");
 
   // cg<iterations>_<p | nop | smask> and gd<iterations>_p
   const std::regex pattern("(cg|gd)([0-9]+)_(p|nop|smask)");
@@ -44,13 +48,13 @@ TEST(GoldenVolumeEstimation, MatchesThePublicImplementation) {
       ConjugateGradientOptions options;
       options.iterations = iterations;
       ConjugateGradientReport report;
-      check(solve_weighted_inverse(slices, geometry, w, start, options, masks, &report), key);
+      check(solve_weighted_inverse(slices, operator_with(masks), w, start, options, &report), key);
       EXPECT_EQ(report.iterations, iterations);
       ++conjugate_gradients;
     } else {
       EdgePreservingOptions options;
       options.iterations = iterations;
-      check(refine_edge_preserving(slices, geometry, w, start, options, masks), key);
+      check(refine_edge_preserving(slices, operator_with(masks), w, start, options), key);
     }
   }
   EXPECT_GE(conjugate_gradients, 2);

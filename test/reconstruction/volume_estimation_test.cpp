@@ -56,7 +56,10 @@ class VolumeEstimation : public testing::Test {
     geometry_ = three_stacks(20, 1.);
     volume_ = phantom();
     slices_ = acquire_slices(volume_, geometry_, 24, 24);
-    start_ = reconstruct_psf(slices_, geometry_, {kSize, kSize, kSize});
+    start_ = reconstruct_psf(slices_, acquisition());
+  }
+  SliceAcquisition acquisition(const AcquisitionMasks& masks = {}) const {
+    return SliceAcquisition(geometry_, 24, 24, {kSize, kSize, kSize}, AcquisitionFormulation::exact, masks);
   }
   AcquisitionGeometry geometry_;
   torch::Tensor volume_, slices_, start_;
@@ -66,7 +69,7 @@ TEST_F(VolumeEstimation, RecoversAPhantomFromEnoughSlices) {
   ConjugateGradientOptions options;
   options.iterations = 30;
   ConjugateGradientReport report;
-  const torch::Tensor solved = solve_weighted_inverse(slices_, geometry_, {}, start_, options, {}, &report);
+  const torch::Tensor solved = solve_weighted_inverse(slices_, acquisition(), {}, start_, options, &report);
   // The PSF reconstruction is blurred by both directions of the operator; the solver undoes it.
   const double before = relative_l2(start_, volume_), after = relative_l2(solved, volume_);
   RecordProperty("relative_l2_psf", std::to_string(before));
@@ -80,7 +83,7 @@ TEST_F(VolumeEstimation, ResidualFallsAndTheToleranceStops) {
   ConjugateGradientOptions options;
   options.iterations = 12;
   ConjugateGradientReport report;
-  solve_weighted_inverse(slices_, geometry_, {}, start_, options, {}, &report);
+  solve_weighted_inverse(slices_, acquisition(), {}, start_, options, &report);
   EXPECT_EQ(report.iterations, 12);
   ASSERT_EQ(report.relative_residual.size(), 13U);
   // Conjugate gradients may raise |r| in a single step, but not over a few on a problem as tame as this.
@@ -90,7 +93,7 @@ TEST_F(VolumeEstimation, ResidualFallsAndTheToleranceStops) {
   const double tolerance = report.relative_residual[5];
   options.tolerance = tolerance * 1.0001;
   ConjugateGradientReport stopped;
-  solve_weighted_inverse(slices_, geometry_, {}, start_, options, {}, &stopped);
+  solve_weighted_inverse(slices_, acquisition(), {}, start_, options, &stopped);
   EXPECT_LE(stopped.iterations, 5);
   EXPECT_GE(stopped.iterations, 1);
   EXPECT_LE(stopped.relative_residual.back(), options.tolerance);
@@ -102,7 +105,7 @@ TEST_F(VolumeEstimation, NoIterationsReturnTheStart) {
   ConjugateGradientReport report;
   const torch::Tensor start = start_ - 0.1;
   EXPECT_TRUE(
-      torch::equal(solve_weighted_inverse(slices_, geometry_, {}, start, options, {}, &report), start.clamp_min(0)));
+      torch::equal(solve_weighted_inverse(slices_, acquisition(), {}, start, options, &report), start.clamp_min(0)));
   EXPECT_EQ(report.iterations, 0);
   EXPECT_EQ(report.relative_residual.size(), 1U);
 }
@@ -116,8 +119,8 @@ TEST_F(VolumeEstimation, WeightZeroRemovesABadSlice) {
   ConjugateGradientOptions options;
   options.iterations = 20;
   const torch::Tensor zero = torch::zeros_like(start_);
-  const double trusting = relative_l2(solve_weighted_inverse(damaged, geometry_, {}, zero, options), volume_);
-  const double weighted = relative_l2(solve_weighted_inverse(damaged, geometry_, weights, zero, options), volume_);
+  const double trusting = relative_l2(solve_weighted_inverse(damaged, acquisition(), {}, zero, options), volume_);
+  const double weighted = relative_l2(solve_weighted_inverse(damaged, acquisition(), weights, zero, options), volume_);
   EXPECT_LT(weighted, 0.04);
   EXPECT_GT(trusting, 5 * weighted);
 }
@@ -128,16 +131,17 @@ TEST_F(VolumeEstimation, NormalOperatorIsSymmetricAndWeighted) {
   acquire_slices(volume_, geometry_, 24, 24, {}, &weight);
   AcquisitionMasks masks;
   masks.slices = weight >= 0.5;
+  const SliceAcquisition masked = acquisition(masks);
   const torch::Tensor p = torch::rand({slices_.size(0)});
   const torch::Tensor a = torch::rand_like(volume_), b = torch::rand_like(volume_);
   const auto product = [](const torch::Tensor& x, const torch::Tensor& y) {
     return (x.to(torch::kFloat64) * y.to(torch::kFloat64)).sum().item<double>();
   };
-  const double left = product(b, apply_normal_operator(a, geometry_, 24, 24, p, masks));
-  const double right = product(a, apply_normal_operator(b, geometry_, 24, 24, p, masks));
+  const double left = product(b, masked.normal(a, p));
+  const double right = product(a, masked.normal(b, p));
   EXPECT_NEAR(left, right, 1e-5 * std::abs(left));
-  const torch::Tensor twice = apply_normal_operator(a, geometry_, 24, 24, 2 * p, masks);
-  EXPECT_TRUE(torch::allclose(twice, 2 * apply_normal_operator(a, geometry_, 24, 24, p, masks), 1e-5, 1e-6));
+  const torch::Tensor twice = masked.normal(a, 2 * p);
+  EXPECT_TRUE(torch::allclose(twice, 2 * masked.normal(a, p), 1e-5, 1e-6));
 }
 
 TEST_F(VolumeEstimation, EmptyDataStayZeroAndFinite) {
@@ -145,12 +149,13 @@ TEST_F(VolumeEstimation, EmptyDataStayZeroAndFinite) {
   options.iterations = 5;
   ConjugateGradientReport report;
   const torch::Tensor zero = torch::zeros_like(volume_);
-  torch::Tensor solved = solve_weighted_inverse(torch::zeros_like(slices_), geometry_, {}, zero, options, {}, &report);
+  torch::Tensor solved = solve_weighted_inverse(torch::zeros_like(slices_), acquisition(), {}, zero, options, &report);
   EXPECT_EQ(solved.abs().sum().item<float>(), 0.F);
   EXPECT_EQ(report.iterations, 0);
   AcquisitionGeometry none = geometry_;
   none.transforms = torch::zeros({0, 3, 4});
-  solved = solve_weighted_inverse(torch::zeros({0, 1, 24, 24}), none, {}, volume_, options);
+  const SliceAcquisition nothing(none, 24, 24, {kSize, kSize, kSize}, AcquisitionFormulation::exact);
+  solved = solve_weighted_inverse(torch::zeros({0, 1, 24, 24}), nothing, {}, volume_, options);
   EXPECT_TRUE(torch::equal(solved, volume_));
 }
 
@@ -159,9 +164,9 @@ TEST_F(VolumeEstimation, SameBytesForAnyThreadCount) {
   options.iterations = 3;
   const int before = at::get_num_threads();
   at::set_num_threads(1);
-  const torch::Tensor one = solve_weighted_inverse(slices_, geometry_, {}, start_, options);
+  const torch::Tensor one = solve_weighted_inverse(slices_, acquisition(), {}, start_, options);
   at::set_num_threads(4);
-  const torch::Tensor four = solve_weighted_inverse(slices_, geometry_, {}, start_, options);
+  const torch::Tensor four = solve_weighted_inverse(slices_, acquisition(), {}, start_, options);
   at::set_num_threads(before);
   EXPECT_TRUE(torch::equal(one, four));
 }
@@ -173,17 +178,17 @@ TEST_F(VolumeEstimation, EdgePreservingStepsRemoveNoise) {
   options.iterations = 10;
   options.step = 0.1;
   options.strength = 0.1;
-  const torch::Tensor smoothed = refine_edge_preserving(slices_, geometry_, weights, noisy, options);
+  const torch::Tensor smoothed = refine_edge_preserving(slices_, acquisition(), weights, noisy, options);
   EXPECT_LT(relative_l2(smoothed, volume_), 0.5 * relative_l2(noisy, volume_));
   options.iterations = 0;
-  EXPECT_TRUE(torch::equal(refine_edge_preserving(slices_, geometry_, weights, volume_, options), volume_));
+  EXPECT_TRUE(torch::equal(refine_edge_preserving(slices_, acquisition(), weights, volume_, options), volume_));
 }
 
 TEST_F(VolumeEstimation, RejectsWhatDoesNotFit) {
   const ConjugateGradientOptions options;
   const auto solve = [&](const torch::Tensor& slices, const torch::Tensor& weights, const torch::Tensor& start,
                          const ConjugateGradientOptions& with) {
-    return solve_weighted_inverse(slices, geometry_, weights, start, with);
+    return solve_weighted_inverse(slices, acquisition(), weights, start, with);
   };
   EXPECT_THROW(solve(slices_.squeeze(1), {}, start_, options), std::invalid_argument);
   EXPECT_THROW(solve(slices_.slice(0, 0, 5), {}, start_, options), std::invalid_argument);
@@ -197,7 +202,7 @@ TEST_F(VolumeEstimation, RejectsWhatDoesNotFit) {
   EXPECT_THROW(solve(slices_, {}, start_, bad), std::invalid_argument);
   EdgePreservingOptions edge;
   edge.edge = 0.;
-  EXPECT_THROW(refine_edge_preserving(slices_, geometry_, {}, start_, edge), std::invalid_argument);
+  EXPECT_THROW(refine_edge_preserving(slices_, acquisition(), {}, start_, edge), std::invalid_argument);
 }
 
 }  // namespace

@@ -41,6 +41,7 @@ struct Estimate {
 
 struct EstimatorOptions {
   std::string method = "nominal";     ///< which implementation; see make_estimator
+  std::string formulation = "fast";   ///< of the forward model; "exact" to match the public implementation to rounding
   double volume_resolution_mm = 1.0;  ///< voxel size of the volume
   double volume_size_mm = 128.0;      ///< edge of the cube that is reconstructed, centred on the brain frame
   double recentre_mm = 10.0;          ///< the brain frame moves only when its centre is off by more than this
@@ -51,6 +52,7 @@ struct EstimatorOptions {
   template <class Visitor>
   void visit(Visitor&& v) {
     v("method", method, "estimator: nominal (the scanner's own poses, no motion estimate)");
+    v("formulation", formulation, "forward model: fast, or exact (every tap of the slice profile, ten times slower)");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume, mm");
     v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
     v("recentre_mm", recentre_mm, "the brain frame moves only when the brain's centre is off by more than this, mm");

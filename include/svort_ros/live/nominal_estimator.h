@@ -2,6 +2,7 @@
 
 #include <string>
 
+#include "svort_ros/acquisition/slice_acquisition.h"
 #include "svort_ros/live/incremental_estimator.h"
 
 namespace svort {
@@ -27,6 +28,7 @@ class NominalEstimator : public IncrementalEstimator {
   void estimate_volume(const SliceSequence& sequence, int cg_iterations);
 
   EstimatorOptions options_;
+  AcquisitionFormulation formulation_;
   ImageGrid grid_;
   Pose T_scanner_brain_ = Pose::Identity();
   Estimate estimate_;

@@ -12,8 +12,8 @@ namespace svort {
 
 /// PSF reconstruction (paper, sec. 2.3): slices scattered with the PSF and divided by the weight that each voxel got.
 /// Voxels that no slice reaches are 0. @return D x H x W
-torch::Tensor reconstruct_psf(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
-                              const std::array<std::int64_t, 3>& volume_shape, const AcquisitionMasks& masks = {});
+/// @throws std::invalid_argument if the slices do not fit the operator
+torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition);
 
 /// When conjugate gradients stop.
 struct ConjugateGradientOptions {
@@ -39,14 +39,10 @@ struct ConjugateGradientReport {
 /// @param start   D x H x W, usually reconstruct_psf()
 /// @throws std::invalid_argument naming the argument if a shape, type or device does not fit, an option is out of
 ///         range, or a weight is negative or not finite
-torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
-                                     const ConjugateGradientOptions& options, const AcquisitionMasks& masks = {},
+                                     const ConjugateGradientOptions& options,
                                      ConjugateGradientReport* report = nullptr);
-
-/// A^T W A x, the normal operator of the weighted inverse problem.
-torch::Tensor apply_normal_operator(const torch::Tensor& volume, const AcquisitionGeometry& geometry, int height,
-                                    int width, const torch::Tensor& weights, const AcquisitionMasks& masks = {});
 
 /// Gradient descent with an edge-preserving prior, for a last refinement.
 struct EdgePreservingOptions {
@@ -61,8 +57,8 @@ struct EdgePreservingOptions {
 ///
 /// The rim of the volume, one voxel wide, has no prior. Matches the public implementation's gradient-descent mode.
 /// Arguments and errors as in solve_weighted_inverse().
-torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const AcquisitionGeometry& geometry,
+torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
-                                     const EdgePreservingOptions& options, const AcquisitionMasks& masks = {});
+                                     const EdgePreservingOptions& options);
 
 }  // namespace svort
