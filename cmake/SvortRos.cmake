@@ -2,7 +2,7 @@
 
 find_package(catkin REQUIRED COMPONENTS
   diagnostic_updater geometry_msgs message_generation nodelet pluginlib rosbag roscpp rosgraph_msgs sensor_msgs
-  std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
+  std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 find_package(OpenCV REQUIRED COMPONENTS core imgproc imgcodecs)
 find_package(VTK REQUIRED COMPONENTS CommonCore CommonDataModel FiltersCore)
 # Debian 12 ships a NIFTI package file whose paths do not exist, so the library is looked up by name.
@@ -21,7 +21,7 @@ catkin_package(
   LIBRARIES svort_geometry svort_acquisition svort_reconstruction svort_sequence svort_live svort_io svort_ros_layer
             svort_nodelet
   CATKIN_DEPENDS diagnostic_updater geometry_msgs message_runtime nodelet pluginlib rosbag roscpp rosgraph_msgs
-                 sensor_msgs std_msgs std_srvs tf2 tf2_eigen tf2_ros visualization_msgs)
+                 sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 
 svort_library(svort_io MODULE io
   LINK svort_live ${NIFTI_LIBRARY} ${ZNZ_LIBRARY} yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json

@@ -486,20 +486,60 @@ visualization_msgs::Marker make_marker(const std_msgs::Header& header, const std
   return marker;
 }
 
-/// Frame around the field that was cut out of the slice; around the whole slice if there is no image.
-visualization_msgs::Marker outline_marker(const svort::SliceEstimate& slice, const SliceImage& image,
-                                          const std_msgs::Header& header) {
+/// The part of a slice that is worth a frame: its brain with a margin, or the whole image if nothing was prepared.
+struct SliceFrame {
+  svort::Pose T_brain_frame = svort::Pose::Identity();
+  Eigen::AlignedBox2d box;  ///< mm, in the plane z = 0
+};
+SliceFrame frame_of(const svort::SliceEstimate& slice, const SliceImage& image) {
+  constexpr double kMargin = 8.;  // mm
+  SliceFrame frame;
+  if (!image.slice) {
+    const Eigen::Vector2d size(slice.info.columns, slice.info.rows);
+    const Eigen::Vector2d half = 0.5 * slice.info.pixel_spacing.cwiseProduct(size);
+    frame.T_brain_frame = slice.T_brain_slice;
+    frame.box = Eigen::AlignedBox2d(-half, half);
+    return frame;
+  }
+  const svort::PreparedSlice& prepared = *image.slice;
+  const double middle = 0.5 * (prepared.size - 1);
+  frame.T_brain_frame = slice.T_brain_slice * prepared.T_slice_crop;
+  for (int row = 0; row < prepared.size; ++row)
+    for (int column = 0; column < prepared.size; ++column)
+      if (prepared.mask[static_cast<std::size_t>(row * prepared.size + column)])
+        frame.box.extend(prepared.resolution * Eigen::Vector2d(column - middle, row - middle));
+  frame.box.extend(Eigen::Vector2d(frame.box.min().array() - kMargin));
+  frame.box.extend(Eigen::Vector2d(frame.box.max().array() + kMargin));
+  return frame;
+}
+
+visualization_msgs::Marker outline_marker(const SliceFrame& frame, const std_msgs::Header& header) {
   visualization_msgs::Marker marker = make_marker(header, "outline", visualization_msgs::Marker::LINE_STRIP, 0.7);
   marker.color = colour(1.F, 0.75F, 0.1F);
-  svort::Pose T_brain_frame = slice.T_brain_slice;
-  Eigen::Vector2d half =
-      0.5 * slice.info.pixel_spacing.cwiseProduct(Eigen::Vector2d(slice.info.columns, slice.info.rows));
-  if (image.slice) {
-    T_brain_frame = T_brain_frame * image.slice->T_slice_crop;
-    half.setConstant(0.5 * image.slice->size * image.slice->resolution);
+  using Box = Eigen::AlignedBox2d;
+  for (const auto corner : {Box::BottomLeft, Box::BottomRight, Box::TopRight, Box::TopLeft, Box::BottomLeft}) {
+    const Eigen::Vector2d p = frame.box.corner(corner);
+    marker.points.push_back(to_point_msg(frame.T_brain_frame * Eigen::Vector3d(p.x(), p.y(), 0.)));
   }
-  for (const auto& [x, y] : {std::pair{-1, -1}, {1, -1}, {1, 1}, {-1, 1}, {-1, -1}})
-    marker.points.push_back(to_point_msg(T_brain_frame * Eigen::Vector3d(x * half.x(), y * half.y(), 0.)));
+  return marker;
+}
+
+/// "stack 1, slice 4" above the frame's highest corner.
+visualization_msgs::Marker label_marker(const svort::SliceEstimate& slice, const SliceFrame& frame,
+                                        const std_msgs::Header& header) {
+  constexpr double kHeight = 6.;  // mm
+  visualization_msgs::Marker marker = make_marker(header, "label", visualization_msgs::Marker::TEXT_VIEW_FACING, 0.);
+  marker.color = colour(1.F, 0.75F, 0.1F);
+  marker.scale.z = to_metres(kHeight);
+  marker.text = "stack " + std::to_string(slice.info.stack) + ", slice " + std::to_string(slice.info.index);
+  using Box = Eigen::AlignedBox2d;
+  Eigen::Vector3d highest(0., 0., -std::numeric_limits<double>::infinity());
+  for (const auto corner : {Box::BottomLeft, Box::BottomRight, Box::TopRight, Box::TopLeft}) {
+    const Eigen::Vector2d p = frame.box.corner(corner);
+    const Eigen::Vector3d position = frame.T_brain_frame * Eigen::Vector3d(p.x(), p.y(), 0.);
+    if (position.z() > highest.z()) highest = position;
+  }
+  marker.pose.position = to_point_msg(highest + Eigen::Vector3d(0., 0., kHeight));
   return marker;
 }
 
@@ -549,8 +589,10 @@ visualization_msgs::Marker plane_marker(const svort::SliceEstimate& slice, const
 visualization_msgs::MarkerArray to_slice_markers(const svort::SliceEstimate& slice, const SliceImage& image,
                                                  const std_msgs::Header& header) {
   visualization_msgs::MarkerArray markers;
-  markers.markers.push_back(outline_marker(slice, image, header));
+  const SliceFrame frame = frame_of(slice, image);
+  markers.markers.push_back(outline_marker(frame, header));
   markers.markers.push_back(axes_marker(slice, header));
+  markers.markers.push_back(label_marker(slice, frame, header));
   if (image.slice) markers.markers.push_back(plane_marker(slice, image, header));
   return markers;
 }

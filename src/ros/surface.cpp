@@ -7,6 +7,8 @@
 #include <vtkNew.h>
 #include <vtkPointData.h>
 #include <vtkPolyData.h>
+#include <vtkPolyDataConnectivityFilter.h>
+#include <vtkWindowedSincPolyDataFilter.h>
 
 #include "svort_ros/ros/conversions.h"
 
@@ -19,10 +21,10 @@ visualization_msgs::Marker to_surface(const svort::Volume& volume, double thresh
   marker.type = visualization_msgs::Marker::TRIANGLE_LIST;
   marker.pose.orientation.w = 1.;
   marker.scale.x = marker.scale.y = marker.scale.z = 1.;
-  marker.color.r = 0.85F;
-  marker.color.g = 0.70F;
-  marker.color.b = 0.65F;
-  marker.color.a = 0.45F;  // the current slice lies inside and must show
+  marker.color.r = 1.F;
+  marker.color.g = 0.84F;
+  marker.color.b = 0.78F;
+  marker.color.a = 0.4F;  // the current slice shows through
 
   const double level = threshold * reference_intensity(volume);
   if (level > 0.) {
@@ -37,9 +39,18 @@ visualization_msgs::Marker to_surface(const svort::Volume& volume, double thresh
     contour->SetValue(0, level);
     contour->ComputeNormalsOff();
     contour->ComputeScalarsOff();
-    contour->Update();
+    // Specks outside the brain and the steps of voxels and mask edges are no anatomy.
+    vtkNew<vtkPolyDataConnectivityFilter> largest;
+    largest->SetInputConnection(contour->GetOutputPort());
+    largest->SetExtractionModeToLargestRegion();
+    vtkNew<vtkWindowedSincPolyDataFilter> smooth;
+    smooth->SetInputConnection(largest->GetOutputPort());
+    smooth->SetNumberOfIterations(20);
+    smooth->SetPassBand(0.03);
+    smooth->NormalizeCoordinatesOn();
+    smooth->Update();
 
-    vtkPolyData* surface = contour->GetOutput();
+    vtkPolyData* surface = smooth->GetOutput();
     marker.points.reserve(3 * static_cast<std::size_t>(surface->GetNumberOfPolys()));
     vtkNew<vtkIdList> triangle;
     for (vtkIdType i = 0; i < surface->GetNumberOfCells(); ++i) {

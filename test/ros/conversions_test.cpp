@@ -427,22 +427,24 @@ TEST(SliceMarkers, OutlineAndPlaneLieInTheSlice) {
   prepared.pixels = {0, 0, 0, 0, 0, 10, 20, 0, 0, 30, 90, 0, 0, 0, 0, 0};
   prepared.mask = {0, 0, 0, 0, 0, 1, 1, 0, 0, 1, 1, 0, 0, 0, 0, 0};
   const auto markers = to_slice_markers(slice, {&prepared, 40.}, std_msgs::Header()).markers;
-  ASSERT_EQ(markers.size(), 3U);
+  ASSERT_EQ(markers.size(), 4U);
   const auto in_slice = [&](const geometry_msgs::Point& p) -> Eigen::Vector3d {
     return some_pose().inverse() * (1000. * Eigen::Vector3d(p.x, p.y, p.z));
   };
-  EXPECT_TRUE(in_slice(markers[0].points[0]).isApprox(Eigen::Vector3d(1., -7., 0.), 1e-9));  // 8 mm around (5, -3)
-  EXPECT_TRUE(in_slice(markers[0].points[2]).isApprox(Eigen::Vector3d(9., 1., 0.), 1e-9));
+  // Brain pixels (1, 1) to (2, 2) lie 1 mm around the crop's centre; the frame leaves 8 mm.
+  EXPECT_TRUE(in_slice(markers[0].points[0]).isApprox(Eigen::Vector3d(-4., -12., 0.), 1e-9));
+  EXPECT_TRUE(in_slice(markers[0].points[2]).isApprox(Eigen::Vector3d(14., 6., 0.), 1e-9));
   EXPECT_TRUE(in_slice(markers[1].points[5]).isApprox(Eigen::Vector3d(0., 0., 20.), 1e-9));  // z axis
-  ASSERT_EQ(markers[2].points.size(), 6U);  // the one block of four brain pixels
-  EXPECT_TRUE(in_slice(markers[2].points[0]).isApprox(Eigen::Vector3d(4., -4., 0.), 1e-9));  // pixel (1, 1)
-  EXPECT_FLOAT_EQ(markers[2].colors[0].r, 0.25F);
-  EXPECT_FLOAT_EQ(markers[2].colors[2].r, 1.F);  // 90 / 40, clipped
+  EXPECT_EQ(markers[2].text, "stack 0, slice 6");
+  ASSERT_EQ(markers[3].points.size(), 6U);  // the one block of four brain pixels
+  EXPECT_TRUE(in_slice(markers[3].points[0]).isApprox(Eigen::Vector3d(4., -4., 0.), 1e-9));  // pixel (1, 1)
+  EXPECT_FLOAT_EQ(markers[3].colors[0].r, 0.25F);
+  EXPECT_FLOAT_EQ(markers[3].colors[2].r, 1.F);  // 90 / 40, clipped
 
-  const auto without_image = to_slice_markers(slice, {}, std_msgs::Header()).markers;
-  ASSERT_EQ(without_image.size(), 2U);
-  EXPECT_TRUE(in_slice(without_image[0].points[0]).isApprox(Eigen::Vector3d(-48., -48., 0.), 1e-9));
-  EXPECT_TRUE(in_slice(without_image[0].points[2]).isApprox(Eigen::Vector3d(48., 48., 0.), 1e-9));
+  const auto unprepared = to_slice_markers(slice, {}, std_msgs::Header()).markers;
+  ASSERT_EQ(unprepared.size(), 3U);  // no plane
+  EXPECT_TRUE(in_slice(unprepared[0].points[0]).isApprox(Eigen::Vector3d(-48., -48., 0.), 1e-9));
+  EXPECT_TRUE(in_slice(unprepared[0].points[2]).isApprox(Eigen::Vector3d(48., 48., 0.), 1e-9));
 }
 
 TEST(SliceFrame, NamesStackAndIndex) { EXPECT_EQ(slice_frame(some_slice().info), "slice_0_6"); }
