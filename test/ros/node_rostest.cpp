@@ -198,7 +198,7 @@ TEST_F(NodeTest, LateSubscribersGetTheLastState) {
   EXPECT_GT(clouds.all().back().width, 1000U);
   EXPECT_EQ(clouds.all().back().header.frame_id, "fetal_brain");
   EXPECT_GT(surfaces.all().back().points.size(), 300U);
-  EXPECT_EQ(markers.all().back().markers.size(), 3U);
+  EXPECT_EQ(markers.all().back().markers.size(), 4U);  // outline, axes, label, plane
   EXPECT_EQ(heads.all().back().header.frame_id, "scanner");
   // The brain frame's origin is the centre of what the masks show: within 3 mm of the phantom's centre in plane.
   EXPECT_NEAR(heads.all().back().pose.position.x, 0.012, 0.006);
