@@ -392,13 +392,15 @@ svort::Volume from_msg(const Volume& message) {
 }
 
 double reference_intensity(const svort::Volume& volume) {
-  std::vector<float> positive;
-  std::copy_if(volume.values.begin(), volume.values.end(), std::back_inserter(positive),
-               [](float value) { return value > 0.F; });
-  if (positive.empty()) return 0.;
-  const auto rank = static_cast<std::ptrdiff_t>(0.99 * static_cast<double>(positive.size() - 1));
-  std::nth_element(positive.begin(), positive.begin() + rank, positive.end());
-  return static_cast<double>(positive[static_cast<std::size_t>(rank)]);
+  if (volume.values.empty()) return 0.;
+  const float floor = 1e-3F * *std::max_element(volume.values.begin(), volume.values.end());
+  if (!(floor > 0.F)) return 0.;
+  std::vector<float> tissue;
+  std::copy_if(volume.values.begin(), volume.values.end(), std::back_inserter(tissue),
+               [floor](float value) { return value > floor; });
+  const auto rank = static_cast<std::ptrdiff_t>(0.99 * static_cast<double>(tissue.size() - 1));
+  std::nth_element(tissue.begin(), tissue.begin() + rank, tissue.end());
+  return static_cast<double>(tissue[static_cast<std::size_t>(rank)]);
 }
 
 svort::Volume coarsen(const svort::Volume& volume, int factor) {

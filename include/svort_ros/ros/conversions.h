@@ -60,8 +60,9 @@ Volume to_msg(const svort::Volume& volume, VolumeEncoding encoding, const svort:
 /// @throws std::invalid_argument if length and size do not fit, or the encoding is unknown
 svort::Volume from_msg(const Volume& message);
 
-/// The intensity that thresholds refer to: 0.99 quantile of the positive values, so that it does not depend on how
-/// much air the grid holds. 0 if no value is positive.
+/// The intensity that thresholds refer to: 0.99 quantile of the values above a thousandth of the largest, so that it
+/// does not depend on how much air the grid holds, nor on the faint rim around what the slices cover. 0 if no value is
+/// positive.
 double reference_intensity(const svort::Volume& volume);
 
 /// Block means over factor^3 voxels; what does not fill a block at the upper ends is left out.
