@@ -391,6 +391,13 @@ svort::Volume from_msg(const Volume& message) {
   return volume;
 }
 
+svort::Arrival rejection(const SliceFromMessage& decoded) {
+  svort::Arrival arrival;
+  arrival.status = decoded.status;
+  arrival.reason = decoded.reason;
+  return arrival;
+}
+
 double reference_intensity(const svort::Volume& volume) {
   if (volume.values.empty()) return 0.;
   const float floor = 1e-3F * *std::max_element(volume.values.begin(), volume.values.end());

@@ -71,14 +71,6 @@ class OutputFolders {
   std::map<std::string, int> used_;
 };
 
-svort::Arrival take_in(svort::LivePipeline& pipeline, const SliceFromMessage& decoded) {
-  if (decoded.ok) return pipeline.add(decoded.slice);
-  svort::Arrival arrival;
-  arrival.status = decoded.status;
-  arrival.reason = decoded.reason;
-  return arrival;
-}
-
 /// Sleeps until the slice is due, and says when that was: waiting behind others counts as latency.
 Clock::time_point wait_for(const Slice& message, const Slice& first, Clock::time_point start, double realtime) {
   if (realtime <= 0.) return Clock::now();
@@ -128,7 +120,7 @@ ReplaySummary replay(const ReplayOptions& options) {
     for (const Slice& message : messages) {
       const Clock::time_point arrived = wait_for(message, messages.front(), start, options.realtime);
       const SliceFromMessage decoded = from_msg(message);
-      const svort::Arrival arrival = take_in(pipeline, decoded);
+      const svort::Arrival arrival = decoded.ok ? pipeline.add(decoded.slice) : rejection(decoded);
       svort::JournalEntry entry = make_journal_entry(pipeline, decoded.slice.info, arrival);
       entry.latency_ms = milliseconds_since(arrived);
       const std::size_t number = pipeline.journal().add(entry);

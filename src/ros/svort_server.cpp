@@ -230,18 +230,14 @@ void SvortServer::Worker::answer(const Slice& message, Clock::time_point arrived
 }
 
 svort::Arrival SvortServer::Worker::take_in(const SliceFromMessage& decoded) {
-  svort::Arrival arrival;
+  if (!decoded.ok) return rejection(decoded);
   const svort::SliceSequence& sequence = pipeline_->sequence();
-  if (!decoded.ok) {
-    arrival.status = decoded.status;
-    arrival.reason = decoded.reason;
-    return arrival;
-  }
   const std::string& scan_id = decoded.slice.info.scan_id;
   if (sequence.slices().empty()) {
     scan_started_ = Clock::now();
   } else if (scan_id != sequence.scan_id() && sequence.check(decoded.slice).starts_scan) {
     if (ended_scans_.count(scan_id)) {  // the sequence knows, unless it was put aside with an unwritten scan
+      svort::Arrival arrival;
       arrival.status = svort::ArrivalStatus::ended_scan;
       arrival.reason = svort::describe(decoded.slice.info) + ": this scan has ended";
       return arrival;

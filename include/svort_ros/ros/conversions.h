@@ -43,6 +43,9 @@ struct SliceFromMessage {
 /// Whether the content makes sense (NaN, zero spacing, empty mask) is for svort::SliceSequence to say.
 SliceFromMessage from_msg(const Slice& message);
 
+/// The answer to a message that holds no slice (`ok` is false).
+svort::Arrival rejection(const SliceFromMessage& decoded);
+
 /// `frame_id` is the scanner frame. Pixels are sent as 32FC1, which is exact.
 Slice to_msg(const svort::Slice& slice, const std::string& frame_id);
 
