@@ -19,6 +19,7 @@ struct NetworkInput {
   torch::Tensor positions;  ///< n x 2: slice index counted from the middle of its stack (index - count / 2), and stack
   torch::Tensor slice_counts;       ///< n, int64: slices prescribed for the slice's stack; versions 1 and 2 ignore it
   torch::Tensor times;              ///< n: acquisition time since the first slice, s; versions 1 and 2 ignore it
+  bool common_frame = true;         ///< `transforms` of all stacks are in one frame; false: each stack has its own
   double slice_resolution_mm = 1.;  ///< pixel size
   double thickness_mm = 3.;         ///< slice thickness (FWHM)
 };
