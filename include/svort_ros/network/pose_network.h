@@ -10,6 +10,8 @@
 
 namespace svort {
 
+class StageClock;
+
 /// What a pose network sees: n slices of one scan, or of a prefix of it, in acquisition order. All tensors are on one
 /// device and float32 unless said otherwise.
 struct NetworkInput {
@@ -34,6 +36,7 @@ struct NetworkGrid {
 struct NetworkRun {
   int iterations = 0;  ///< K; 0: as many as the network was made for
   AcquisitionFormulation formulation = AcquisitionFormulation::exact;
+  StageClock* clock = nullptr;  ///< takes the time of each stage, if not null
 };
 
 /// State after one iteration: transformation update, then volume estimation.
@@ -42,6 +45,7 @@ struct NetworkStep {
   torch::Tensor transforms;  ///< n x 3 x 4, trans_first, mm
   torch::Tensor weights;     ///< n, quality of each slice; undefined if the network has none
   torch::Tensor volume;      ///< D x H x W; undefined if the network estimates none
+  torch::Tensor attention;   ///< heads x n x n, weights of the last layer; undefined if the network has none
 };
 
 /// A network that turns slices into poses: SVoRT in its versions, the live network, the baselines of the paper.
