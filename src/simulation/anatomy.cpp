@@ -1,0 +1,256 @@
+#include "svort_ros/simulation/anatomy.h"
+
+#include <torch/torch.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <sstream>
+#include <stdexcept>
+
+#include "purposes.h"
+#include "svort_ros/simulation/random_stream.h"
+
+namespace svort {
+namespace {
+
+namespace F = torch::nn::functional;
+
+constexpr double kSigmaOfFwhm = 1. / 2.3548200450309493;
+
+void require(bool ok, const char* option, double value, const char* limit) {
+  if (ok) return;
+  std::ostringstream text;
+  text << "anatomy." << option << " is " << value << ", must be " << limit;
+  throw std::invalid_argument(text.str());
+}
+
+/// out x in matrix that low-passes and samples one axis. Positions are index * spacing + first, mm.
+torch::Tensor axis_filter(std::int64_t in, double in_first, double in_mm, std::int64_t out, double out_first,
+                          double out_mm, double sigma_mm) {
+  const torch::Tensor from = torch::arange(in, torch::kFloat64) * in_mm + in_first;
+  const torch::Tensor to = torch::arange(out, torch::kFloat64) * out_mm + out_first;
+  const torch::Tensor distance = (to.unsqueeze(1) - from.unsqueeze(0)).abs();
+  // A Gaussian much narrower than a voxel would pick single voxels: interpolate linearly then.
+  const torch::Tensor weights = sigma_mm < 0.35 * in_mm ? (1. - distance / in_mm).clamp_min(0.)
+                                                        : torch::exp(-0.5 * torch::pow(distance / sigma_mm, 2));
+  return (weights / weights.sum(1, true).clamp_min(1e-6)).to(torch::kFloat32);
+}
+
+/// Applies one matrix per axis (z, y, x) to c x d x h x w.
+torch::Tensor apply_axes(const torch::Tensor& volume, const std::array<torch::Tensor, 3>& axes) {
+  torch::Tensor result = torch::matmul(volume, axes[2].t());
+  result = torch::matmul(axes[1], result);
+  return torch::matmul(axes[0], result.transpose(1, 2)).transpose(1, 2);
+}
+
+/// Uniform cubic B-spline.
+double b_spline(double t) {
+  t = std::abs(t);
+  if (t < 1.) return 2. / 3. - t * t + 0.5 * t * t * t;
+  if (t < 2.) return (2. - t) * (2. - t) * (2. - t) / 6.;
+  return 0.;
+}
+
+float quantile_within(const torch::Tensor& image, const torch::Tensor& mask, double quantile) {
+  const torch::Tensor values = std::get<0>(image.masked_select(mask).sort());
+  const auto rank = static_cast<std::int64_t>(quantile * static_cast<double>(values.numel() - 1));
+  return values[rank].item<float>();
+}
+
+}  // namespace
+
+AnatomyOptions no_anatomy_variation() {
+  AnatomyOptions options;
+  options.scale_min = options.scale_max = 1.;
+  options.aspect = options.elastic_mm = options.contrast = 0.;
+  return options;
+}
+
+AnatomySource::AnatomySource(const std::vector<BrainVolume>& volumes, const NetworkGrid& grid,
+                             const AnatomyOptions& options, torch::Device device)
+    : grid_(grid), options_(options), device_(device) {
+  const torch::NoGradGuard no_grad;
+  require(options.scale_min > 0.1 && options.scale_min <= options.scale_max, "scale_min", options.scale_min,
+          "above 0.1 and at most scale_max");
+  require(options.scale_max < 10., "scale_max", options.scale_max, "below 10");
+  require(options.aspect >= 0. && options.aspect <= 0.2, "aspect", options.aspect, "in 0 .. 0.2");
+  require(options.elastic_mm >= 0. && options.elastic_mm <= 20., "elastic_mm", options.elastic_mm, "in 0 .. 20");
+  require(options.elastic_spacing_mm >= 5. && options.elastic_spacing_mm <= 200., "elastic_spacing_mm",
+          options.elastic_spacing_mm, "in 5 .. 200");
+  require(options.contrast >= 0. && options.contrast <= 1., "contrast", options.contrast, "in 0 .. 1");
+  if (volumes.empty()) throw std::invalid_argument("simulator: at least one brain volume is needed");
+  if (!(grid.resolution_mm > 0.) || grid.volume_shape[0] < 2 || grid.volume_shape[1] < 2 || grid.volume_shape[2] < 2)
+    throw std::invalid_argument("simulator: the grid must have at least 2 voxels along each axis, of a positive size");
+
+  for (const BrainVolume& volume : volumes) {
+    check(volume);
+    Source source;
+    source.extent = brain_extent(volume);
+    const double native = volume.resolution_mm;
+    source.resolution_mm = std::max(native, grid.resolution_mm / 1.6);
+    const double blur_mm2 = std::max(0., grid.resolution_mm * grid.resolution_mm - native * native);
+    const double sigma = kSigmaOfFwhm * std::sqrt(blur_mm2);
+
+    const torch::Tensor mask = volume.mask.to(device);
+    torch::Tensor image = volume.image.to(device);
+    image = (image / quantile_within(image, mask, 0.99)).masked_fill(~mask, 0.);
+    std::vector<torch::Tensor> channels;
+    channels.push_back(mask.to(torch::kFloat32));
+    if (volume.labels.defined()) {
+      const torch::Tensor labels = volume.labels.to(device);
+      const int most = labels.max().item<int>();
+      for (int label = 0; label <= most; ++label) {
+        const torch::Tensor of_label = image.masked_fill(labels != label, 0.);
+        if (label == 0 || of_label.any().item<bool>()) channels.push_back(of_label);
+      }
+    } else {
+      channels.push_back(image);
+    }
+
+    std::array<torch::Tensor, 3> axes;
+    for (int axis = 0; axis < 3; ++axis) {
+      // A margin for the low-pass; array dimensions are z, y, x.
+      const double reach = source.extent.half_size[axis] + 2. * sigma + 2. * source.resolution_mm;
+      const auto out = 2 * static_cast<std::int64_t>(std::ceil(reach / source.resolution_mm)) + 1;
+      const std::int64_t in = volume.image.size(2 - axis);
+      axes[static_cast<std::size_t>(2 - axis)] =
+          axis_filter(in, -0.5 * static_cast<double>(in - 1) * native, native, out,
+                      source.extent.centre[axis] - 0.5 * static_cast<double>(out - 1) * source.resolution_mm,
+                      source.resolution_mm, sigma)
+              .to(device);
+    }
+    std::vector<torch::Tensor> filtered;
+    for (const torch::Tensor& channel : channels) filtered.push_back(apply_axes(channel.unsqueeze(0), axes));
+    torch::Tensor all = torch::cat(filtered).contiguous();
+    // Means over the brain alone: at its border the low-pass must not mix in the dark outside.
+    all.slice(0, 1).div_(all.slice(0, 0, 1).clamp_min(0.1));
+    source.channels = all;
+    sources_.push_back(source);
+  }
+}
+
+Anatomy AnatomySource::make(std::uint64_t seed, std::uint64_t number) const {
+  const torch::NoGradGuard no_grad;
+  const Source& source = sources_[volume_of(number)];
+  RandomStream random(seed, number, purpose::kAnatomy);
+  const double size = random.uniform(options_.scale_min, options_.scale_max);
+  Eigen::Vector3d scale;
+  for (int axis = 0; axis < 3; ++axis) scale[axis] = size * std::exp(random.normal(options_.aspect));
+
+  // Tissue contrast: a factor per class.
+  const std::int64_t classes = source.channels.size(0) - 1;
+  std::vector<float> factors(static_cast<std::size_t>(classes), 1.F);
+  if (classes > 1)
+    for (float& factor : factors) factor = static_cast<float>(std::exp(random.normal(options_.contrast)));
+  const torch::Tensor weights = torch::tensor(factors).to(device_);
+  const torch::Tensor brain = source.channels.slice(0, 0, 1);
+  const torch::Tensor image = torch::matmul(weights, source.channels.slice(0, 1).flatten(1)).view(brain.sizes());
+  const torch::Tensor input = torch::cat({brain, image}).unsqueeze(0);
+
+  // The part of the grid that the brain can reach.
+  const Eigen::Vector3d centre = source.extent.centre;
+  const Eigen::Vector3d reach = source.extent.half_size.cwiseProduct(scale) +
+                                Eigen::Vector3d::Constant(4. * options_.elastic_mm + 2. * grid_.resolution_mm);
+  std::array<std::int64_t, 3> first{}, count{};  // x, y, z
+  std::array<torch::Tensor, 3> position;         // of the output voxels from the brain's centre, mm
+  for (int axis = 0; axis < 3; ++axis) {
+    const auto a = static_cast<std::size_t>(axis);
+    const std::int64_t voxels = grid_.volume_shape[2 - a];
+    const double middle = centre[axis] / grid_.resolution_mm + 0.5 * static_cast<double>(voxels - 1);
+    const double half = reach[axis] / grid_.resolution_mm;
+    first[a] = std::clamp<std::int64_t>(static_cast<std::int64_t>(std::floor(middle - half)), 0, voxels - 1);
+    const auto last =
+        std::clamp<std::int64_t>(static_cast<std::int64_t>(std::ceil(middle + half)), first[a], voxels - 1);
+    count[a] = last - first[a] + 1;
+    position[a] =
+        (torch::arange(count[a], torch::kFloat64) + (static_cast<double>(first[a]) - middle)) * grid_.resolution_mm;
+  }
+
+  // Smooth deformation on a lattice of control points; its rigid part is taken out, or it would be an unknown pose.
+  torch::Tensor displacement;  // 3 x z x y x x, mm
+  if (options_.elastic_mm > 0.) {
+    const double spacing = options_.elastic_spacing_mm;
+    std::array<std::int64_t, 3> points{};
+    std::array<torch::Tensor, 3> basis;
+    for (std::size_t a = 0; a < 3; ++a) {
+      points[a] = 2 * static_cast<std::int64_t>(std::ceil(reach[static_cast<int>(a)] / spacing)) + 3;
+      basis[a] = torch::empty({count[a], points[a]}, torch::kFloat32);
+      auto values = basis[a].accessor<float, 2>();
+      const auto where = position[a].accessor<double, 1>();
+      for (std::int64_t i = 0; i < count[a]; ++i)
+        for (std::int64_t k = 0; k < points[a]; ++k)
+          values[i][k] = static_cast<float>(
+              b_spline(where[i] / spacing - (static_cast<double>(k) - 0.5 * static_cast<double>(points[a] - 1))));
+    }
+    const std::int64_t total = points[0] * points[1] * points[2];
+    Eigen::Matrix3Xd node(3, total), moved(3, total);
+    // Independent coefficients of deviation 1 make a spline of this deviation, on average over the lattice.
+    const double spline_deviation = std::pow(151. / 315., 1.5);
+    std::int64_t i = 0;
+    for (std::int64_t k = 0; k < points[2]; ++k)
+      for (std::int64_t j = 0; j < points[1]; ++j)
+        for (std::int64_t l = 0; l < points[0]; ++l, ++i) {
+          node.col(i) << static_cast<double>(2 * l - points[0] + 1), static_cast<double>(2 * j - points[1] + 1),
+              static_cast<double>(2 * k - points[2] + 1);
+          moved.col(i) = random.normal3(options_.elastic_mm / spline_deviation);
+        }
+    moved.colwise() -= moved.rowwise().mean().eval();
+    Eigen::Matrix3d inertia = Eigen::Matrix3d::Zero();
+    Eigen::Vector3d moment = Eigen::Vector3d::Zero();
+    for (std::int64_t n = 0; n < total; ++n) {
+      const Eigen::Vector3d p = node.col(n);
+      inertia += p.squaredNorm() * Eigen::Matrix3d::Identity() - p * p.transpose();
+      moment += p.cross(Eigen::Vector3d(moved.col(n)));
+    }
+    const Eigen::Vector3d rotation = inertia.ldlt().solve(moment);
+    torch::Tensor coefficients = torch::empty({3, points[2], points[1], points[0]}, torch::kFloat32);
+    float* out = coefficients.data_ptr<float>();
+    for (std::int64_t n = 0; n < total; ++n) {
+      const Eigen::Vector3d rest = moved.col(n) - rotation.cross(Eigen::Vector3d(node.col(n)));
+      for (int axis = 0; axis < 3; ++axis) out[axis * total + n] = static_cast<float>(rest[axis]);
+    }
+    displacement =
+        apply_axes(coefficients.to(device_), {basis[2].to(device_), basis[1].to(device_), basis[0].to(device_)});
+  }
+
+  // Where each output voxel comes from, in grid_sample's coordinates.
+  torch::Tensor where =
+      torch::empty({1, count[2], count[1], count[0], 3}, torch::TensorOptions().dtype(torch::kFloat32).device(device_));
+  for (int axis = 0; axis < 3; ++axis) {
+    const auto a = static_cast<std::size_t>(axis);
+    std::array<std::int64_t, 3> view{1, 1, 1};
+    view[2 - a] = count[a];
+    const double half_mm = 0.5 * static_cast<double>(input.size(4 - axis) - 1) * source.resolution_mm;
+    const torch::Tensor along = (position[a] / (scale[axis] * half_mm)).to(torch::kFloat32).view(view).to(device_);
+    torch::Tensor target = where.select(4, axis).squeeze(0);
+    if (displacement.defined())
+      torch::add_out(target, along.expand_as(target), displacement[axis], 1. / half_mm);
+    else
+      target.copy_(along.expand_as(target));
+  }
+  const torch::Tensor sampled = F::grid_sample(
+      input, where,
+      F::GridSampleFuncOptions().mode(torch::kBilinear).padding_mode(torch::kZeros).align_corners(true))[0];
+
+  Anatomy anatomy;
+  const auto on_device = torch::TensorOptions().device(device_);
+  const auto& shape = grid_.volume_shape;
+  anatomy.image = torch::zeros({shape[0], shape[1], shape[2]}, on_device.dtype(torch::kFloat32));
+  anatomy.mask = torch::zeros({shape[0], shape[1], shape[2]}, on_device.dtype(torch::kBool));
+  const auto part = [&](const torch::Tensor& volume) {
+    return volume.narrow(0, first[2], count[2]).narrow(1, first[1], count[1]).narrow(2, first[0], count[0]);
+  };
+  const torch::Tensor inside = sampled[0] > 0.5;
+  part(anatomy.mask).copy_(inside);
+  part(anatomy.image).copy_(sampled[1] * inside);
+  BrainVolume measured;
+  measured.mask = anatomy.mask;
+  measured.resolution_mm = grid_.resolution_mm;
+  if (!inside.any().item<bool>())
+    throw std::invalid_argument("simulator: the brain does not reach into the grid; is the volume centred?");
+  anatomy.extent = brain_extent(measured);
+  return anatomy;
+}
+
+}  // namespace svort
