@@ -466,6 +466,7 @@ std::vector<SimulatedScan> ScanSimulator::simulate(std::uint64_t first, int coun
     scan.input.positions = part(all_positions);
     scan.input.slice_counts = part(all_counts);
     scan.input.times = part(all_times);
+    scan.input.common_frame = options_.scanner.protocol != "uniform";
     scan.input.slice_resolution_mm = pixel;
     scan.input.thickness_mm = scan.plan.thickness_mm;
     scan.masks = part(masks);

@@ -143,6 +143,7 @@ TEST(ScanSimulator, UniformProtocolHidesTheOrientation) {
   options.scanner.protocol = "uniform";
   ScanSimulator simulator(phantoms(), coarse_grid(), options, 1);
   const auto scan = simulator.simulate(0, 1)[0];
+  EXPECT_FALSE(scan.input.common_frame);
   const torch::Tensor rotations = scan.input.transforms.slice(2, 0, 3);
   EXPECT_LT((rotations - torch::eye(3)).abs().max().item<double>(), 1e-6);
   std::set<int> stacks;
