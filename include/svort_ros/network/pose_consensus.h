@@ -1,0 +1,52 @@
+#pragma once
+
+#include <torch/types.h>
+
+#include "svort_ros/geometry/anchor_points.h"
+
+namespace svort {
+
+/// What every slice of a scan says about its own place. All tensors float32, CPU, n slices.
+struct PoseVotes {
+  torch::Tensor nominal;     ///< n x 3 x 4, trans_first, mm: the prescription, in a frame common to a group
+  torch::Tensor direct;      ///< n x 9, mm: anchor points in the brain frame
+  torch::Tensor mirrored;    ///< n x 9, mm: the same up to a reflection of x; undefined if there is no such head
+  torch::Tensor scale;       ///< n, mm: expected error of each vote; undefined means all alike
+  torch::Tensor stack;       ///< n, int64: which stack each slice belongs to
+  AnchorFrame frame;         ///< that the anchor points belong to
+  bool common_frame = true;  ///< the nominal poses of all stacks share one frame; false: only those of one stack do
+};
+
+struct ConsensusOptions {
+  double robust_mm = 20.;    ///< votes further off than this lose influence; lower it for a well trained network
+  int candidates = 48;       ///< slices (spread over the group) whose votes are tried as starting points
+  int refined = 6;           ///< best candidates that are refined
+  int iterations = 12;       ///< reweighted least-squares steps of each
+  double stack_prior = -1.;  ///< negative: one motion per group; else each stack may deviate, in slices
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v("robust_mm", robust_mm, "votes further off than this lose influence, mm");
+    v("candidates", candidates, "slices whose votes are tried as starting points");
+    v("refined", refined, "best starting points that are refined");
+    v("iterations", iterations, "reweighted least-squares steps of each");
+    v("stack_prior", stack_prior,
+      "negative: one head pose per scan; else the weight that holds a stack to it, in slices");
+  }
+};
+
+/// The rigid motions from nominal frame to brain frame that agree with most votes.
+///
+/// A brain is nearly symmetric, so a slice alone often cannot tell itself from its mirror image; the mirror images of
+/// all slices, however, do not fit the prescribed geometry together. So each mirrored vote counts with whichever of
+/// its two readings is nearer. Starting points are the motions that single votes imply; the best are refined by
+/// iteratively reweighted Procrustes fits. Deterministic.
+///
+/// If the stacks share a frame there is one motion for all; with stack_prior >= 0 each stack then gets its own, held to
+/// the common one by that many slices' worth of weight. Stacks without a common frame are solved one by one.
+///
+/// @return n x 3 x 4, trans_first, mm, float32: for each slice the motion that follows its nominal pose
+/// @throws std::invalid_argument naming the tensor or option that does not fit
+torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& options);
+
+}  // namespace svort

@@ -1,0 +1,301 @@
+#include "svort_ros/network/live_network.h"
+
+#include <gtest/gtest.h>
+#include <torch/torch.h>
+
+#include <cmath>
+#include <string>
+
+#include "svort_ros/acquisition/point_spread_function.h"
+#include "svort_ros/geometry/rigid_transform.h"
+
+namespace {
+
+using svort::LiveNetwork;
+using svort::LiveNetworkOptions;
+using svort::NetworkInput;
+
+// Large enough to have every part, small enough to be quick.
+LiveNetworkOptions small() {
+  LiveNetworkOptions options;
+  options.width = 8;
+  options.dim = 24;
+  options.heads = 2;
+  options.layers = 2;
+  options.hidden = 32;
+  return options;
+}
+
+// n slices of one blob each, at random places.
+NetworkInput random_input(std::int64_t n, std::uint64_t seed = 1) {
+  torch::manual_seed(static_cast<std::int64_t>(seed));
+  NetworkInput input;
+  const torch::Tensor axis = torch::linspace(-1., 1., 64);
+  const torch::Tensor blob = ((axis.view({1, 64}).square() + axis.view({64, 1}).square()) < 0.4).to(torch::kFloat32);
+  input.slices = torch::rand({n, 1, 64, 64}) * blob;
+  input.transforms =
+      svort::axisangle_to_matrix(torch::randn({n, 6}) * torch::tensor({.5F, .5F, .5F, 10.F, 10.F, 10.F}));
+  const torch::Tensor index = torch::arange(n);
+  input.positions = torch::stack({(index % 20 - 10).to(torch::kFloat32), (index / 20).to(torch::kFloat32)}, 1);
+  input.slice_counts = torch::full({n}, 20, torch::kInt64);
+  input.times = index.to(torch::kFloat32) * 1.2;
+  input.slice_resolution_mm = 2.;
+  return input;
+}
+
+NetworkInput rows(const NetworkInput& input, const torch::Tensor& index) {
+  NetworkInput result = input;
+  for (auto member : {&NetworkInput::slices, &NetworkInput::transforms, &NetworkInput::positions,
+                      &NetworkInput::slice_counts, &NetworkInput::times}) {
+    result.*member = (input.*member).index_select(0, index);
+  }
+  return result;
+}
+
+// Random weights everywhere, also where training starts from 0.
+void randomise(LiveNetwork& network) {
+  const torch::NoGradGuard no_grad;
+  torch::manual_seed(5);
+  for (auto& parameter : network.named_parameters()) {
+    if (parameter.key().find("norm.weight") != std::string::npos) {
+      parameter.value().uniform_(0.5, 1.5);
+    } else {
+      parameter.value().normal_(0., 0.1);
+    }
+  }
+}
+
+// Sums over many slices are grouped in other ways for other batch sizes: rounding of float32.
+constexpr double kRounding = 2e-5;
+
+TEST(LiveNetwork, DefaultsAreWithinTheLimitsOnSize) {
+  const LiveNetwork network;
+  std::int64_t count = 0;
+  for (const torch::Tensor& parameter : network.parameters()) count += parameter.numel();
+  EXPECT_LE(count, 8000000);
+  EXPECT_GE(count, 1000000);
+  EXPECT_LE(2 * count, std::int64_t{16} << 20);  // bytes in half precision
+}
+
+TEST(LiveNetwork, FeaturesOfASliceDependOnThatSliceAlone) {
+  const torch::NoGradGuard no_grad;
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(7);
+  const torch::Tensor together = network.encode(input.slices, 2.);
+  for (std::int64_t i = 0; i < 7; ++i) {
+    const torch::Tensor alone = network.encode(input.slices.slice(0, i, i + 1), 2.);
+    EXPECT_TRUE(torch::allclose(alone[0], together[i], kRounding, kRounding)) << "slice " << i;
+  }
+  EXPECT_TRUE(torch::equal(network.encode(input.slices, 2.), together));
+}
+
+TEST(LiveNetwork, TheUnitOfIntensityDoesNotMatter) {
+  const torch::NoGradGuard no_grad;
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(3);
+  EXPECT_TRUE(torch::allclose(network.encode(7. * input.slices, 2.), network.encode(input.slices, 2.), 1e-4, 1e-4));
+}
+
+TEST(LiveNetwork, CachedFeaturesGiveThePoseOfAGrowingScan) {
+  const torch::NoGradGuard no_grad;
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(9);
+  const torch::Tensor cached = network.encode(input.slices, 2.);
+  for (const std::int64_t n : {1, 4, 9}) {
+    const NetworkInput prefix = rows(input, torch::arange(n));
+    const auto fresh = network.attend(network.encode(prefix.slices, 2.), prefix);
+    const auto reused = network.attend(cached.slice(0, 0, n), prefix);
+    EXPECT_TRUE(torch::allclose(reused.points, fresh.points, kRounding, kRounding));
+  }
+}
+
+TEST(LiveNetwork, TheOrderInWhichSlicesAreListedDoesNotMatter) {
+  const torch::NoGradGuard no_grad;
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(10);
+  const torch::Tensor order = torch::tensor({3, 1, 9, 0, 2, 8, 7, 4, 6, 5}, torch::kInt64);
+  const NetworkInput shuffled = rows(input, order);
+  const auto first = network.attend(network.encode(input.slices, 2.), input);
+  const auto other = network.attend(network.encode(shuffled.slices, 2.), shuffled);
+  for (const auto member : {&svort::LiveOutput::points, &svort::LiveOutput::mirrored, &svort::LiveOutput::log_scale,
+                            &svort::LiveOutput::quality}) {
+    EXPECT_TRUE(torch::allclose((other.*member), (first.*member).index_select(0, order), kRounding, kRounding));
+  }
+}
+
+TEST(LiveNetwork, ScansOfOneBatchDoNotSeeEachOther) {
+  const torch::NoGradGuard no_grad;
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput all = random_input(12);
+  const torch::Tensor features = network.encode(all.slices, 2.);
+  const std::vector<std::int64_t> lengths = {5, 1, 6};
+  std::vector<torch::Tensor> attention;
+  const auto together = network.attend(features, all, lengths, &attention);
+  std::int64_t begin = 0;
+  for (const std::int64_t length : lengths) {
+    const torch::Tensor index = torch::arange(begin, begin + length);
+    const auto alone = network.attend(features.index_select(0, index), rows(all, index));
+    EXPECT_TRUE(torch::allclose(together.points.index_select(0, index), alone.points, kRounding, kRounding));
+    begin += length;
+  }
+  ASSERT_EQ(attention.size(), 2U);  // layers
+  EXPECT_EQ(attention[0].sizes(), (std::vector<std::int64_t>{3, 2, 6, 6}));
+  EXPECT_EQ(attention[0][1].slice(-1, 1, 6).abs().max().item<float>(), 0.F);  // nobody looks at the padding
+  EXPECT_TRUE(torch::allclose(attention[1].sum(-1), torch::ones({3, 2, 6})));
+  EXPECT_THROW(network.attend(features, all, {5, 6}), std::invalid_argument);
+}
+
+TEST(LiveNetwork, GradientsReachEveryParameter) {
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(6);
+  const auto first = network.attend(network.encode(input.slices, 2.), input);
+  const auto shared = network.update(torch::rand({6, svort::kLiveSimulatedChannels, 64, 64}), input);
+  (first.points.square().sum() + first.mirrored.square().sum() + first.log_scale.square().sum() +
+   first.quality.square().sum() + shared.points.square().sum() + shared.log_scale.square().sum() +
+   shared.quality.square().sum())
+      .backward();
+  for (const auto& parameter : network.named_parameters()) {
+    ASSERT_TRUE(parameter.value().grad().defined()) << parameter.key();
+    EXPECT_GT(parameter.value().grad().abs().max().item<float>(), 0.F) << parameter.key();
+  }
+}
+
+TEST(LiveNetwork, HalfPrecisionConvolutionsSayNearlyTheSameAndHaveGradients) {
+  LiveNetwork network(small());
+  randomise(network);
+  const NetworkInput input = random_input(6);
+  const torch::Tensor exact = network.encode(input.slices, 2.).detach();
+  network.set_precision(torch::kBFloat16);
+  const torch::Tensor rounded = network.encode(input.slices, 2.);
+  EXPECT_EQ(rounded.scalar_type(), torch::kFloat32);
+  // bfloat16 has 8 bits: 0.4 % per operation, over a dozen of them.
+  EXPECT_LT((rounded - exact).norm().item<float>(), 0.05 * exact.norm().item<float>());
+  EXPECT_GT((rounded - exact).norm().item<float>(), 0.F);
+  rounded.sum().backward();
+  EXPECT_GT(network.parameters()[0].grad().abs().max().item<float>(), 0.F);
+}
+
+TEST(LiveNetwork, RunsOnOneSliceAndOn450) {
+  LiveNetwork network(small());
+  randomise(network);
+  for (const std::int64_t n : {1, 450}) {
+    svort::NetworkRun run;
+    run.iterations = 2;
+    run.formulation = svort::AcquisitionFormulation::fast;
+    const auto steps = network.run(random_input(n), {{32, 32, 32}, 4.}, run);
+    ASSERT_EQ(steps.size(), 2U);
+    for (const auto& step : steps) {
+      EXPECT_EQ(step.points.sizes(), (std::vector<std::int64_t>{n, 9}));
+      EXPECT_EQ(step.weights.sizes(), (std::vector<std::int64_t>{n}));
+      const torch::Tensor rotation = step.transforms.slice(2, 0, 3);
+      EXPECT_TRUE(torch::allclose(torch::matmul(rotation.transpose(1, 2), rotation), torch::eye(3).expand({n, 3, 3}),
+                                  1e-4, 1e-4));
+      EXPECT_TRUE(step.transforms.isfinite().all().item<bool>());
+    }
+    EXPECT_EQ(steps.back().volume.sizes(), (std::vector<std::int64_t>{32, 32, 32}));
+    EXPECT_GT(steps.back().volume.max().item<float>(), 0.F);
+  }
+}
+
+TEST(LiveNetwork, AblationsAreWhatTheirNamesSay) {
+  const torch::NoGradGuard no_grad;
+  const NetworkInput input = random_input(5);
+  NetworkInput elsewhere = input;
+  elsewhere.transforms = random_input(5, 2).transforms;
+
+  LiveNetworkOptions options = small();
+  LiveNetwork with_position(options);
+  options.positional_embedding = false;
+  LiveNetwork without_position(options);
+  randomise(with_position);
+  randomise(without_position);
+  const auto points_at = [](LiveNetwork& network, const NetworkInput& at) {
+    return network.attend(network.encode(at.slices, 2.), at).points;
+  };
+  EXPECT_TRUE(torch::equal(points_at(without_position, input), points_at(without_position, elsewhere)));
+  EXPECT_FALSE(torch::allclose(points_at(with_position, input), points_at(with_position, elsewhere)));
+
+  svort::NetworkRun run;
+  for (const int k : {1, 2, 3}) {
+    run.iterations = k;
+    EXPECT_EQ(with_position.run(input, {{32, 32, 32}, 4.}, run).size(), static_cast<std::size_t>(k));
+  }
+  options = small();
+  options.volume_conditioned = false;
+  LiveNetwork blind(options);
+  randomise(blind);
+  run.iterations = 2;
+  EXPECT_FALSE(torch::allclose(blind.run(input, {{32, 32, 32}, 4.}, run)[1].points,
+                               with_position.run(input, {{32, 32, 32}, 4.}, run)[1].points));
+}
+
+TEST(LiveNetwork, AnUpdateThatNamesTheWayToTheTruthGoesThere) {
+  const LiveNetworkOptions options;
+  torch::manual_seed(8);
+  const torch::Tensor here = svort::axisangle_to_matrix(torch::randn({6, 6}));
+  const torch::Tensor truth = svort::compose_transforms(here, svort::axisangle_to_matrix(0.2 * torch::randn({6, 6})));
+  const svort::AnchorFrame frame = svort::live_anchor_frame(options);
+  const torch::Tensor rest = svort::anchor_points_from_matrix(torch::eye(4).slice(0, 0, 3).unsqueeze(0), frame);
+  const torch::Tensor way =
+      (svort::anchor_points_from_matrix(svort::compose_transforms(svort::inverse_transform(here), truth), frame) -
+       rest) /
+      svort::kLiveUpdateUnitMm;
+  EXPECT_TRUE(torch::allclose(svort::apply_live_update(here, way, options), truth, 1e-4, 1e-3));
+  EXPECT_TRUE(torch::allclose(svort::apply_live_update(here, torch::zeros({6, 9}), options), here, 1e-4, 1e-3));
+}
+
+TEST(LiveNetwork, SimulatedChannelsShowTheVolumeAndItsSlopeAlongTheNormal) {
+  // A stack of slices that get brighter along their normal, in any orientation.
+  const LiveNetworkOptions options;
+  constexpr std::int64_t kSlices = 21;
+  torch::Tensor axisangle = torch::tensor({0.4F, -0.8F, 0.3F, 0.F, 0.F, 0.F}).repeat({kSlices, 1});
+  torch::Tensor slices = torch::zeros({kSlices, 1, 64, 64});
+  for (std::int64_t i = 0; i < kSlices; ++i) {
+    axisangle[i][5] = 2. * static_cast<double>(i - 10);
+    slices[i].slice(1, 16, 48).slice(2, 16, 48) = 1. + 0.02 * static_cast<double>(i);
+  }
+  const torch::Tensor seen = svort::simulate_live_channels(slices, svort::axisangle_to_matrix(axisangle), options, 3.,
+                                                           svort::AcquisitionFormulation::fast);
+  ASSERT_EQ(seen.sizes(), (std::vector<std::int64_t>{kSlices, svort::kLiveSimulatedChannels, 64, 64}));
+  const auto middle = [&seen](int channel) {
+    return seen[10][channel].slice(0, 26, 38).slice(1, 26, 38).mean().item<double>();
+  };
+  EXPECT_NEAR(middle(0), 1.2, 0.01);
+  EXPECT_NEAR(middle(1), 0.01 * 2. * svort::kLiveNormalStepMm, 0.01);  // 0.01 per mm, from one step behind to one ahead
+  EXPECT_EQ(seen.select(1, 0).masked_select(slices.select(1, 0) == 0).abs().max().item<float>(), 0.F);
+}
+
+TEST(LiveNetwork, AveragesWholePixelsAndRejectsWhatDoesNotFit) {
+  LiveNetwork network(small());
+  const torch::Tensor fine = torch::rand({2, 1, 128, 128});
+  const torch::Tensor coarse = network.reduce(fine, 1.);
+  ASSERT_EQ(coarse.sizes(), (std::vector<std::int64_t>{2, 1, 64, 64}));
+  EXPECT_NEAR(coarse[1][0][3][5].item<float>(), fine[1][0].slice(0, 6, 8).slice(1, 10, 12).mean().item<float>(), 1e-6);
+  EXPECT_THROW(network.reduce(torch::rand({2, 1, 100, 100}), 1.), std::invalid_argument);
+  EXPECT_THROW(network.reduce(fine, 1.3), std::invalid_argument);
+  EXPECT_THROW(network.reduce(torch::rand({2, 128, 128}), 1.), std::invalid_argument);
+
+  const auto rejects = [](const char* name, const std::function<void(LiveNetworkOptions&)>& change) {
+    LiveNetworkOptions options = small();
+    change(options);
+    try {
+      const LiveNetwork made(options);
+      ADD_FAILURE() << name << " was accepted";
+    } catch (const std::invalid_argument& error) {
+      EXPECT_NE(std::string(error.what()).find(name), std::string::npos) << error.what();
+    }
+  };
+  rejects("input_px", [](auto& o) { o.input_px = 60; });
+  rejects("width", [](auto& o) { o.width = 12; });
+  rejects("heads", [](auto& o) { o.heads = 5; });
+  rejects("layers", [](auto& o) { o.layers = 0; });
+  rejects("iterations", [](auto& o) { o.iterations = 0; });
+}
+
+}  // namespace
