@@ -1,0 +1,301 @@
+#include "svort_ros/registration/pose_refinement.h"
+
+#include <torch/torch.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <sstream>
+#include <stdexcept>
+#include <utility>
+
+#include "../acquisition/parallel.h"
+#include "registration_level.h"
+#include "svort_ros/acquisition/point_spread_function.h"
+#include "svort_ros/acquisition/slice_acquisition.h"
+#include "svort_ros/geometry/rigid_transform.h"
+#include "trajectory.h"
+
+namespace svort {
+namespace {
+
+constexpr double kFwhmPerSigma = 2.354820045;
+constexpr double kInPlaneFwhm = 1.2;  // pixels (paper, sec. 2)
+
+void check(const RefinementOptions& options) {
+  const auto require = [](bool condition, const char* name, double value, const char* range) {
+    if (condition) return;
+    std::ostringstream message;
+    message << "registration." << name << " is " << value << "; it must be " << range;
+    throw std::invalid_argument(message.str());
+  };
+  require(options.finest_mm >= 0.5 && options.finest_mm <= 4., "finest_mm", options.finest_mm, "from 0.5 to 4 mm");
+  require(options.step_mm > 0. && options.step_mm <= 100., "step_mm", options.step_mm, "above 0, at most 100 mm");
+  require(options.jump_mm > 0., "jump_mm", options.jump_mm, "positive");
+  require(options.stack_gap_factor >= 0., "stack_gap_factor", options.stack_gap_factor, "zero or positive");
+  require(options.lever_mm > 0., "lever_mm", options.lever_mm, "positive");
+  require(options.image_scale > 0., "image_scale", options.image_scale, "positive");
+  require(options.image_trust > 0. && options.image_trust <= 1., "image_trust", options.image_trust,
+          "above 0, at most 1");
+  require(options.largest_step_mm > 0., "largest_step_mm", options.largest_step_mm, "positive");
+  require(options.outlier_ncc >= -1. && options.outlier_ncc < 1., "outlier_ncc", options.outlier_ncc,
+          "from -1 to below 1");
+  require(options.stack_passes >= 0, "stack_passes", options.stack_passes, "zero or positive");
+  require(options.trajectory_passes >= 0, "trajectory_passes", options.trajectory_passes, "zero or positive");
+}
+
+AcquisitionGeometry geometry_of(const std::vector<Pose>& poses, const std::vector<double>& thickness_mm,
+                                double pixel_mm, double voxel_mm) {
+  AcquisitionGeometry geometry;
+  const auto n = static_cast<std::int64_t>(poses.size());
+  geometry.transforms = torch::empty({n, 3, 4}, torch::kFloat32);
+  geometry.psf_of_slice = torch::empty({n}, torch::kInt64);
+  geometry.resolution_ratio = pixel_mm / voxel_mm;
+  std::map<double, std::int64_t> psf_of_thickness;
+  std::vector<torch::Tensor> psfs;
+  for (std::int64_t i = 0; i < n; ++i) {
+    const double thickness = thickness_mm[static_cast<std::size_t>(i)];
+    const auto [psf, is_new] = psf_of_thickness.try_emplace(thickness, static_cast<std::int64_t>(psfs.size()));
+    if (is_new)
+      psfs.push_back(gaussian_psf({geometry.resolution_ratio, geometry.resolution_ratio, thickness / voxel_mm}));
+    geometry.psf_of_slice.data_ptr<std::int64_t>()[i] = psf->second;
+    Pose pose = poses[static_cast<std::size_t>(i)];
+    pose.translation() /= voxel_mm;
+    geometry.transforms[i].copy_(tensor_from_pose(pose).squeeze(0));
+  }
+  geometry.psf = stack_psfs(psfs);
+  return geometry;
+}
+
+torch::Tensor weighted_volume(const torch::Tensor& slices, const torch::Tensor& masks, const std::vector<Pose>& poses,
+                              const std::vector<double>& thickness_mm, const std::vector<double>& weights,
+                              double pixel_mm, std::int64_t size, double voxel_mm) {
+  const AcquisitionGeometry geometry = geometry_of(poses, thickness_mm, pixel_mm, voxel_mm);
+  const SliceAcquisition acquisition(geometry, static_cast<int>(slices.size(2)), static_cast<int>(slices.size(3)),
+                                     {size, size, size}, AcquisitionFormulation::fast, {masks, {}});
+  torch::Tensor w = torch::empty({static_cast<std::int64_t>(weights.size())}, torch::kFloat32);
+  for (std::size_t i = 0; i < weights.size(); ++i) w.data_ptr<float>()[i] = static_cast<float>(weights[i]);
+  const torch::Tensor per_pixel = w.view({-1, 1, 1, 1}) * masks.to(torch::kFloat32);
+  const torch::Tensor sums = acquisition.adjoint(slices * per_pixel, false);
+  const torch::Tensor total = acquisition.adjoint(per_pixel.contiguous(), false);
+  const float floor = 1e-3F * std::max(1e-12F, total.max().item<float>());
+  return torch::where(total > floor, sums / total.clamp_min(floor), torch::zeros_like(sums));
+}
+
+struct LevelPlan {
+  double pixel_mm, blur_mm;
+  int passes;
+  bool per_stack;
+};
+
+/// One run of refine_poses().
+class Refiner {
+ public:
+  Refiner(const RegistrationInput& input, const std::vector<Pose>& start, const RefinementOptions& options)
+      : input_(input), options_(options), poses_(start), slices_(start.size()) {
+    for (std::size_t i = 0; i + 1 < input.count(); ++i) {
+      // Each slice's repetition time is taken for one step of the walk, whatever it is in seconds.
+      const bool same_stack = input.stack[i] == input.stack[i + 1];
+      const double spread = same_stack ? options.step_mm : options.step_mm * options.stack_gap_factor;
+      spread_mm_.push_back(spread > 0. ? spread : std::numeric_limits<double>::infinity());
+    }
+  }
+
+  Refinement run() {
+    // Coarse to fine; the volume is blurred as the slices are. The coarsest level catches motions of centimetres.
+    const double middle = std::max(2., options_.finest_mm), coarse = 2. * middle;
+    const int passes = options_.trajectory_passes;
+    std::vector<LevelPlan> plan = {{coarse, 1.5 * coarse, options_.stack_passes, true},
+                                   {coarse, 1.5 * coarse, 2 * passes, false},
+                                   {middle, 2. * middle, options_.stack_passes, true},
+                                   {middle, 2. * middle, passes + 1, false},
+                                   {middle, middle, passes, false},
+                                   {middle, 0.5 * middle, passes, false}};
+    if (options_.finest_mm < middle) plan.push_back({options_.finest_mm, 0., passes, false});
+    for (const LevelPlan& level : plan)
+      if (level.passes > 0) run_level(level);
+
+    Refinement result;
+    for (std::size_t i = 0; i < slices_.size(); ++i) slices_[i].T_brain_slice = poses_[i];
+    result.slices = std::move(slices_);
+    report_.converged = report_.passes > 0 && report_.last_motion_mm <= options_.convergence_mm;
+    result.report = report_;
+    return result;
+  }
+
+ private:
+  void run_level(const LevelPlan& plan) {
+    if (plan.pixel_mm != level_pixel_ || plan.blur_mm != level_blur_) {
+      level_ = make_level(input_, plan.pixel_mm, plan.blur_mm);
+      level_pixel_ = plan.pixel_mm;
+      level_blur_ = plan.blur_mm;
+    }
+    for (int pass = 0; pass < plan.passes; ++pass) {
+      reconstruct();
+      constexpr int kStackSteps = 4, kTrajectorySteps = 3;
+      const std::vector<Pose> before = poses_;
+      for (int step = 0; step < (plan.per_stack ? kStackSteps : kTrajectorySteps); ++step) {
+        evaluate();
+        if (pass == 0 && step == 0) report_.first_cost = mean_cost();
+        if (plan.per_stack)
+          step_stacks();
+        else
+          step_trajectory();
+      }
+      evaluate();
+      weigh();
+      report_.last_cost = mean_cost();
+      report_.last_motion_mm = 0.;
+      for (std::size_t i = 0; i < poses_.size(); ++i)
+        report_.last_motion_mm += motion_size(twist_of(poses_[i] * before[i].inverse()), options_.lever_mm) /
+                                  static_cast<double>(poses_.size());
+      ++report_.passes;
+      if (report_.last_motion_mm <= options_.convergence_mm) break;
+    }
+  }
+
+  void reconstruct() {
+    double radius = level_.field_radius_mm;
+    for (const Pose& pose : poses_) radius = std::max(radius, std::min(pose.translation().norm(), 60.) + 0.5 * radius);
+    const auto size = static_cast<std::int64_t>(std::ceil(2. * std::min(radius, 90.) / level_.pixel_mm)) + 6;
+    std::vector<double> weights;
+    for (const RefinedSlice& slice : slices_) weights.push_back(slice.weight);
+    const torch::Tensor volume = weighted_volume(level_.slices, level_.masks, poses_, input_.thickness_mm, weights,
+                                                 level_.pixel_mm, size, level_.pixel_mm);
+    std::vector<float> values(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
+    volume_ = SampledVolume(blurred(std::move(values), static_cast<int>(size), kInPlaneFwhm / kFwhmPerSigma),
+                            static_cast<int>(size), level_.pixel_mm);
+  }
+
+  void evaluate() {
+    terms_.resize(poses_.size());
+    const double in_plane = kInPlaneFwhm * level_.pixel_mm / kFwhmPerSigma;
+    parallel_tasks(static_cast<std::int64_t>(poses_.size()), [&](std::int64_t task) {
+      const auto i = static_cast<std::size_t>(task);
+      const double through = input_.thickness_mm[i] / kFwhmPerSigma;
+      const ProfileTaps taps = profile_taps(std::sqrt(std::max(0., through * through - in_plane * in_plane)));
+      SliceTermOptions options;
+      options.image_scale = options_.image_scale * level_.bright;
+      options.offset_spread = 0.1 * level_.bright;
+      options.gain = slices_[i].gain;
+      options.offset = slices_[i].offset;
+      terms_[i] = slice_terms(level_.points[i], taps, volume_, poses_[i], options);
+    });
+    for (std::size_t i = 0; i < poses_.size(); ++i) {
+      slices_[i].gain = terms_[i].gain;
+      slices_[i].offset = terms_[i].offset;
+      slices_[i].ncc = terms_[i].ncc;
+    }
+  }
+
+  double mean_cost() const {
+    double sum = 0., pixels = 0.;
+    for (std::size_t i = 0; i < terms_.size(); ++i) {
+      const auto count = static_cast<double>(level_.points[i].value.size());
+      sum += terms_[i].cost * count;
+      pixels += count;
+    }
+    return pixels > 0. ? sum / pixels : 0.;
+  }
+
+  void weigh() {
+    for (RefinedSlice& slice : slices_) {
+      slice.reason.clear();
+      if (!std::isfinite(slice.ncc)) {
+        slice.weight = 0.;
+        slice.reason = "too few pixels, or none that differ";
+      } else if (slice.ncc < options_.outlier_ncc) {
+        slice.weight = 0.;
+        std::ostringstream reason;
+        reason.precision(2);
+        reason << std::fixed << "correlation " << slice.ncc << " with the volume, below " << options_.outlier_ncc;
+        slice.reason = reason.str();
+      } else {
+        slice.weight = std::pow(slice.ncc, 4.);
+      }
+    }
+    // All of them outliers: then none is, or there would be no volume to return to.
+    if (std::all_of(slices_.begin(), slices_.end(), [](const RefinedSlice& s) { return s.weight == 0.; }))
+      for (RefinedSlice& slice : slices_)
+        if (std::isfinite(slice.ncc)) slice.weight = 1e-3;
+  }
+
+  Vector6d bounded(const Vector6d& step) const {
+    const double size = motion_size(step, options_.lever_mm);
+    return size > options_.largest_step_mm ? Vector6d(step * (options_.largest_step_mm / size)) : step;
+  }
+
+  void step_stacks() {
+    std::map<int, std::pair<Matrix6d, Vector6d>> sums;
+    for (std::size_t i = 0; i < poses_.size(); ++i) {
+      auto [sum, is_new] = sums.try_emplace(input_.stack[i], Matrix6d::Zero(), Vector6d::Zero());
+      sum->second.first += terms_[i].hessian;
+      sum->second.second += terms_[i].gradient;
+    }
+    std::map<int, Pose> steps;
+    for (auto& [stack, sum] : sums) {
+      Matrix6d hessian = sum.first;
+      hessian.diagonal() *= 1. + 1e-4;
+      hessian.diagonal().array() += 1e-9;
+      steps[stack] = motion(bounded(-hessian.ldlt().solve(sum.second)));
+    }
+    for (std::size_t i = 0; i < poses_.size(); ++i) poses_[i] = steps[input_.stack[i]] * poses_[i];
+  }
+
+  void step_trajectory() {
+    // The image terms in units of their noise: the residuals' own scale, and far fewer independent pixels than pixels.
+    const double noise = std::max(2. * mean_cost(), 1e-6 * level_.bright * level_.bright);
+    const double area = level_.pixel_mm * level_.pixel_mm;
+    const double trust = options_.image_trust * area / noise;
+    std::vector<SliceTerms> scaled = terms_;
+    std::vector<Pose> motions;
+    for (std::size_t i = 0; i < poses_.size(); ++i) {
+      const double factor = trust * std::max(0.05, slices_[i].weight);
+      scaled[i].hessian *= factor;
+      scaled[i].gradient *= factor;
+      motions.push_back(poses_[i] * input_.T_world_slice[i].inverse());
+    }
+    WalkOptions walk;
+    walk.lever_mm = options_.lever_mm;
+    walk.jump_mm = options_.jump_mm / options_.step_mm;
+    const std::vector<Vector6d> steps = solve_trajectory(scaled, motions, spread_mm_, walk);
+    for (std::size_t i = 0; i < poses_.size(); ++i) poses_[i] = motion(bounded(steps[i])) * poses_[i];
+  }
+
+  const RegistrationInput& input_;
+  const RefinementOptions& options_;
+  std::vector<Pose> poses_;
+  std::vector<RefinedSlice> slices_;
+  std::vector<double> spread_mm_;
+  std::vector<SliceTerms> terms_;
+  RegistrationLevel level_;
+  double level_pixel_ = 0., level_blur_ = 0.;
+  SampledVolume volume_;
+  RefinementReport report_;
+};
+
+}  // namespace
+
+Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
+                        const RefinementOptions& options) {
+  validate(input);
+  check(options);
+  if (start.size() != input.count())
+    throw std::invalid_argument("registration: " + std::to_string(start.size()) + " start poses for " +
+                                std::to_string(input.count()) + " slices");
+  const torch::NoGradGuard no_grad;
+  return Refiner(input, start, options).run();
+}
+
+torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::vector<Pose>& poses,
+                                   const std::vector<double>& weights, std::int64_t size, double voxel_mm) {
+  validate(input);
+  if (poses.size() != input.count() || weights.size() != input.count())
+    throw std::invalid_argument("registration: poses and weights must have one entry per slice");
+  const torch::NoGradGuard no_grad;
+  return weighted_volume(input.slices, input.masks, poses, input.thickness_mm, weights, input.resolution_mm, size,
+                         voxel_mm);
+}
+
+}  // namespace svort
