@@ -38,6 +38,8 @@ void check(const RefinementOptions& options) {
   require(options.image_scale > 0., "image_scale", options.image_scale, "positive");
   require(options.image_trust > 0. && options.image_trust <= 1., "image_trust", options.image_trust,
           "above 0, at most 1");
+  require(options.one_stack_trust > 0. && options.one_stack_trust <= 1., "one_stack_trust", options.one_stack_trust,
+          "above 0, at most 1");
   require(options.largest_step_mm > 0., "largest_step_mm", options.largest_step_mm, "positive");
   require(options.outlier_ncc >= -1. && options.outlier_ncc < 1., "outlier_ncc", options.outlier_ncc,
           "from -1 to below 1");
@@ -94,6 +96,9 @@ class Refiner {
  public:
   Refiner(const RegistrationInput& input, const std::vector<Pose>& start, const RefinementOptions& options)
       : input_(input), options_(options), poses_(start), slices_(start.size()) {
+    one_stack_ = input.stack.front() == input.stack.back() &&
+                 std::count(input.stack.begin(), input.stack.end(), input.stack.front()) ==
+                     static_cast<std::ptrdiff_t>(input.count());
     for (std::size_t i = 0; i + 1 < input.count(); ++i) {
       // Each slice's repetition time is taken for one step of the walk, whatever it is in seconds.
       const bool same_stack = input.stack[i] == input.stack[i + 1];
@@ -247,7 +252,7 @@ class Refiner {
     // The image terms in units of their noise: the residuals' own scale, and far fewer independent pixels than pixels.
     const double noise = std::max(2. * mean_cost(), 1e-6 * level_.bright * level_.bright);
     const double area = level_.pixel_mm * level_.pixel_mm;
-    const double trust = options_.image_trust * area / noise;
+    const double trust = options_.image_trust * (one_stack_ ? options_.one_stack_trust : 1.) * area / noise;
     std::vector<SliceTerms> scaled = terms_;
     std::vector<Pose> motions;
     for (std::size_t i = 0; i < poses_.size(); ++i) {
@@ -270,6 +275,7 @@ class Refiner {
   std::vector<double> spread_mm_;
   std::vector<SliceTerms> terms_;
   RegistrationLevel level_;
+  bool one_stack_ = false;
   double level_pixel_ = 0., level_blur_ = 0.;
   SampledVolume volume_;
   RefinementReport report_;

@@ -16,11 +16,14 @@ struct RefinementOptions {
   double lever_mm = 40.;         ///< distance from the centre at which rotations are measured, about a head's radius
   double image_scale = 0.12;     ///< Cauchy scale of intensity differences, as part of the 0.99 quantile
   double image_trust = 0.02;     ///< independent measurements per pixel; lower it if poses follow noise
-  double largest_step_mm = 3.;   ///< bound of one Gauss-Newton step of a slice
-  double convergence_mm = 0.1;   ///< converged when the mean motion of the last pass is below this
-  double outlier_ncc = 0.3;      ///< a slice that correlates less with the volume gets weight 0
-  int stack_passes = 3;          ///< volumes reconstructed in the stack stage; 0 skips it
-  int trajectory_passes = 3;     ///< volumes reconstructed per level of the trajectory stage
+  /// The same, as a factor, while there is one stack: its slices hardly overlap, and would gather where they look
+  /// alike.
+  double one_stack_trust = 0.1;
+  double largest_step_mm = 3.;  ///< bound of one Gauss-Newton step of a slice
+  double convergence_mm = 0.1;  ///< converged when the mean motion of the last pass is below this
+  double outlier_ncc = 0.3;     ///< a slice that correlates less with the volume gets weight 0
+  int stack_passes = 3;         ///< volumes reconstructed in the stack stage; 0 skips it
+  int trajectory_passes = 3;    ///< volumes reconstructed per level of the trajectory stage
 
   template <class Visitor>
   void visit(Visitor&& v) {
@@ -31,6 +34,7 @@ struct RefinementOptions {
     v("lever_mm", lever_mm, "distance from the centre at which rotations are measured, mm");
     v("image_scale", image_scale, "Cauchy scale of intensity differences, as part of the 0.99 quantile");
     v("image_trust", image_trust, "independent measurements per pixel");
+    v("one_stack_trust", one_stack_trust, "factor of image_trust while there is one stack only");
     v("largest_step_mm", largest_step_mm, "bound of one Gauss-Newton step of a slice, mm");
     v("convergence_mm", convergence_mm, "converged when the mean motion of the last pass is below this, mm");
     v("outlier_ncc", outlier_ncc, "a slice that correlates less with the volume gets weight 0");
