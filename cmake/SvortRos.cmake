@@ -19,7 +19,7 @@ generate_messages(DEPENDENCIES geometry_msgs sensor_msgs std_msgs)
 catkin_package(
   INCLUDE_DIRS include
   LIBRARIES svort_geometry svort_acquisition svort_reconstruction svort_network svort_sequence
-            svort_live svort_simulation svort_io svort_ros_layer
+            svort_registration svort_live svort_simulation svort_io svort_ros_layer
             svort_nodelet
   CATKIN_DEPENDS diagnostic_updater geometry_msgs message_runtime nodelet pluginlib rosbag roscpp rosgraph_msgs
                  sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)

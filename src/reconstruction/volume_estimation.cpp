@@ -61,6 +61,18 @@ torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisitio
   return acquisition.adjoint(slices, /*equalize=*/true);
 }
 
+torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition,
+                              const torch::Tensor& weights) {
+  const torch::Tensor w = checked_weights(weights, acquisition.slice_count(), "reconstruct_psf");
+  if (!w.defined() || (w == 1).all().item<bool>()) return reconstruct_psf(slices, acquisition);
+  const torch::Tensor sums = acquisition.adjoint((slices * w).contiguous(), false);
+  const torch::Tensor total = acquisition.adjoint(w.expand_as(slices).contiguous(), false);
+  // As for equal weights: what only the far end of a PSF reaches is empty.
+  constexpr double kThreshold = 1e-3;
+  const torch::Tensor least = (kThreshold * total.max()).clamp_min(1e-12);
+  return torch::where(total > least, sums / total.clamp_min(least.item<float>()), torch::zeros_like(sums));
+}
+
 torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
                                      const ConjugateGradientOptions& options, ConjugateGradientReport* report) {

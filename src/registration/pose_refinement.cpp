@@ -15,6 +15,7 @@
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
 #include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/reconstruction/volume_estimation.h"
 #include "trajectory.h"
 
 namespace svort {
@@ -78,11 +79,7 @@ torch::Tensor weighted_volume(const torch::Tensor& slices, const torch::Tensor& 
                                      {size, size, size}, AcquisitionFormulation::fast, {masks, {}});
   torch::Tensor w = torch::empty({static_cast<std::int64_t>(weights.size())}, torch::kFloat32);
   for (std::size_t i = 0; i < weights.size(); ++i) w.data_ptr<float>()[i] = static_cast<float>(weights[i]);
-  const torch::Tensor per_pixel = w.view({-1, 1, 1, 1}) * masks.to(torch::kFloat32);
-  const torch::Tensor sums = acquisition.adjoint(slices * per_pixel, false);
-  const torch::Tensor total = acquisition.adjoint(per_pixel.contiguous(), false);
-  const float floor = 1e-3F * std::max(1e-12F, total.max().item<float>());
-  return torch::where(total > floor, sums / total.clamp_min(floor), torch::zeros_like(sums));
+  return reconstruct_psf(slices, acquisition, w);
 }
 
 struct LevelPlan {

@@ -25,8 +25,6 @@ class NominalEstimator : public IncrementalEstimator {
   std::string device() const override { return "cpu"; }
 
  private:
-  void estimate_volume(const SliceSequence& sequence, int cg_iterations);
-
   EstimatorOptions options_;
   AcquisitionFormulation formulation_;
   ImageGrid grid_;

@@ -15,6 +15,12 @@ namespace svort {
 /// @throws std::invalid_argument if the slices do not fit the operator
 torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition);
 
+/// The same with slices that count by their weights w: sum of w x PSF x pixel divided by the sum of w x PSF.
+/// @param weights n, float32; undefined or all 1: as without
+/// @throws std::invalid_argument if slices or weights do not fit, or a weight is negative or not finite
+torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition,
+                              const torch::Tensor& weights);
+
 /// When conjugate gradients stop.
 struct ConjugateGradientOptions {
   int iterations = 2;     ///< at most so many; 0 returns the start
