@@ -7,9 +7,9 @@ endif()
 
 # Warnings and sanitizers of this project's own targets.
 function(svort_target_options target)
-  target_compile_options(${target} PRIVATE -Wall -Wextra -Wconversion -Wshadow)
+  target_compile_options(${target} PRIVATE $<$<COMPILE_LANGUAGE:CXX>:-Wall -Wextra -Wconversion -Wshadow>)
   if(SVORT_WERROR)
-    target_compile_options(${target} PRIVATE -Werror)
+    target_compile_options(${target} PRIVATE $<$<COMPILE_LANGUAGE:CXX>:-Werror>)
   endif()
   if(SVORT_SANITIZE)
     # GCC 12 takes an instrumented std::optional for uninitialised.
@@ -29,4 +29,19 @@ function(svort_library name)
                                             $<INSTALL_INTERFACE:include>)
   target_link_libraries(${name} PUBLIC ${ARG_LINK})
   svort_target_options(${name})
+endfunction()
+
+# Adds src/<folder>/cuda to a library: kernels (.cu) and what calls them.
+function(svort_cuda_sources name folder)
+  if(NOT TARGET torch_cuda)
+    message(FATAL_ERROR "SVORT_WITH_CUDA needs a LibTorch that was built with CUDA")
+  endif()
+  enable_language(CUDA)
+  file(GLOB sources CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/src/${folder}/cuda/*.cpp
+       ${PROJECT_SOURCE_DIR}/src/${folder}/cuda/*.cu)
+  target_sources(${name} PRIVATE ${sources})
+  target_compile_definitions(${name} PUBLIC SVORT_WITH_CUDA)
+  # The last bit of a position decides whether a tap counts: as on the CPU, nothing is fused.
+  set_source_files_properties(${sources} PROPERTIES COMPILE_OPTIONS "$<$<COMPILE_LANGUAGE:CUDA>:-fmad=false>")
+  set_target_properties(${name} PROPERTIES CUDA_STANDARD 17 CUDA_STANDARD_REQUIRED ON)
 endfunction()

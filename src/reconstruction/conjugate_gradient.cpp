@@ -88,4 +88,31 @@ torch::Tensor conjugate_gradient(const LinearOperator& apply, const torch::Tenso
   return solution;
 }
 
+torch::Tensor unrolled_conjugate_gradient(const LinearOperator& apply, const torch::Tensor& b,
+                                          const torch::Tensor& start, const ConjugateGradientOptions& options,
+                                          ConjugateGradientReport* report) {
+  const auto product = [](const torch::Tensor& x, const torch::Tensor& y) { return (x * y).sum(torch::kFloat64); };
+  torch::Tensor x = start, r = b - apply(x), p = r;
+  torch::Tensor squared_residual = product(r, r);
+  const double norm_b = std::sqrt(product(b, b).item<double>());
+  const double scale = norm_b > 0. ? norm_b : 1.;
+  ConjugateGradientReport done;
+  done.relative_residual.push_back(std::sqrt(squared_residual.item<double>()) / scale);
+  while (done.iterations < options.iterations && done.relative_residual.back() > options.tolerance) {
+    const torch::Tensor image = apply(p);
+    const torch::Tensor curvature = product(p, image);
+    if (!(curvature.item<double>() > 0.)) break;
+    const torch::Tensor step = (squared_residual / curvature).to(x.scalar_type());
+    x = x + step * p;
+    r = r - step * image;
+    const torch::Tensor squared_residual_new = product(r, r);
+    p = r + (squared_residual_new / squared_residual).to(x.scalar_type()) * p;
+    squared_residual = squared_residual_new;
+    ++done.iterations;
+    done.relative_residual.push_back(std::sqrt(squared_residual.item<double>()) / scale);
+  }
+  if (report != nullptr) *report = done;
+  return x;
+}
+
 }  // namespace svort

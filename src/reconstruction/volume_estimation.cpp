@@ -2,9 +2,13 @@
 
 #include <torch/torch.h>
 
+#include <array>
 #include <cmath>
+#include <cstdint>
+#include <sstream>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 #include "conjugate_gradient.h"
 #include "edge_prior.h"
@@ -12,47 +16,44 @@
 namespace svort {
 namespace {
 
-// The weights as n x 1 x 1 x 1, or undefined.
-torch::Tensor checked_weights(const torch::Tensor& weights, std::int64_t slices, const char* function) {
-  if (!weights.defined()) return weights;
-  if (weights.dim() != 1 || weights.size(0) != slices || weights.scalar_type() != torch::kFloat32 ||
-      !weights.device().is_cpu()) {
-    throw std::invalid_argument(std::string(function) + ": weights must be " + std::to_string(slices) +
-                                " float32 values on the CPU, one per slice");
+// "4 x 1 x 8 x 8, Float, on cpu", for messages.
+std::string text_of(const std::vector<std::int64_t>& shape, const torch::TensorOptions& options) {
+  std::ostringstream text;
+  for (std::size_t axis = 0; axis < shape.size(); ++axis) text << (axis ? " x " : "") << shape[axis];
+  text << ", " << c10::toString(c10::typeMetaToScalarType(options.dtype())) << ", on " << options.device();
+  return text.str();
+}
+
+void check(const torch::Tensor& tensor, const std::vector<std::int64_t>& shape, const SliceAcquisition& acquisition,
+           const char* function, const char* name) {
+  const torch::TensorOptions options = acquisition.options();
+  if (tensor.defined() && tensor.sizes() == torch::IntArrayRef(shape) && tensor.dtype() == options.dtype() &&
+      tensor.device() == options.device()) {
+    return;
   }
+  throw std::invalid_argument(std::string(function) + ": " + name + " must be " + text_of(shape, options) +
+                              ", as the operator's");
+}
+
+void check_weights(const torch::Tensor& weights, const SliceAcquisition& acquisition, const char* function) {
+  if (!weights.defined()) return;
+  check(weights, {acquisition.slice_count()}, acquisition, function, "weights");
   if (!(torch::isfinite(weights) & (weights >= 0)).all().item<bool>()) {
     throw std::invalid_argument(std::string(function) + ": weights must be finite and not negative");
   }
-  return weights.detach().view({-1, 1, 1, 1});
+}
+
+void check_problem(const torch::Tensor& slices, const SliceAcquisition& acquisition, const torch::Tensor& weights,
+                   const torch::Tensor& start, const char* function) {
+  const std::array<std::int64_t, 3> shape = acquisition.volume_shape();
+  const std::int64_t n = acquisition.slice_count();
+  check(start, {shape[0], shape[1], shape[2]}, acquisition, function, "start");
+  check(slices, {n, 1, acquisition.height(), acquisition.width()}, acquisition, function, "slices");
+  check_weights(weights, acquisition, function);
 }
 
 torch::Tensor weighted(const torch::Tensor& slices, const torch::Tensor& weights) {
-  return weights.defined() ? slices * weights : slices;
-}
-
-void check_start(const torch::Tensor& start, const SliceAcquisition& acquisition, const char* function) {
-  const std::array<std::int64_t, 3> shape = acquisition.volume_shape();
-  if (!start.defined() || start.sizes() != torch::IntArrayRef(shape) || start.scalar_type() != torch::kFloat32 ||
-      !start.device().is_cpu()) {
-    throw std::invalid_argument(std::string(function) + ": start must be " + std::to_string(shape[0]) + " x " +
-                                std::to_string(shape[1]) + " x " + std::to_string(shape[2]) +
-                                ", float32, on the CPU, as the operator's volume");
-  }
-}
-
-void check_slices(const torch::Tensor& slices, const SliceAcquisition& acquisition, const char* function) {
-  const std::array<std::int64_t, 4> shape = {acquisition.slice_count(), 1, acquisition.height(), acquisition.width()};
-  if (!slices.defined() || slices.sizes() != torch::IntArrayRef(shape) || slices.scalar_type() != torch::kFloat32 ||
-      !slices.device().is_cpu()) {
-    throw std::invalid_argument(std::string(function) + ": slices must be " + std::to_string(shape[0]) + " x 1 x " +
-                                std::to_string(shape[2]) + " x " + std::to_string(shape[3]) +
-                                ", float32, on the CPU, as the operator's slices");
-  }
-}
-
-// The weights, contiguous, or undefined.
-torch::Tensor flat(const torch::Tensor& weights) {
-  return weights.defined() ? weights.reshape({-1}).contiguous() : weights;
+  return weights.defined() ? slices * weights.view({-1, 1, 1, 1}) : slices;
 }
 
 }  // namespace
@@ -63,14 +64,17 @@ torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisitio
 
 torch::Tensor reconstruct_psf(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                               const torch::Tensor& weights) {
-  const torch::Tensor w = checked_weights(weights, acquisition.slice_count(), "reconstruct_psf");
-  if (!w.defined() || (w == 1).all().item<bool>()) return reconstruct_psf(slices, acquisition);
-  const torch::Tensor sums = acquisition.adjoint((slices * w).contiguous(), false);
-  const torch::Tensor total = acquisition.adjoint(w.expand_as(slices).contiguous(), false);
+  check_weights(weights, acquisition, "reconstruct_psf");
+  const bool records = torch::GradMode::is_enabled() && weights.defined() && weights.requires_grad();
+  if (!weights.defined() || (!records && (weights == 1).all().item<bool>())) {
+    return reconstruct_psf(slices, acquisition);
+  }
+  const torch::Tensor sums = acquisition.adjoint(weighted(slices, weights), /*equalize=*/false);
+  const torch::Tensor total = acquisition.adjoint(weighted(torch::ones_like(slices), weights), /*equalize=*/false);
   // As for equal weights: what only the far end of a PSF reaches is empty.
   constexpr double kThreshold = 1e-3;
-  const torch::Tensor least = (kThreshold * total.max()).clamp_min(1e-12);
-  return torch::where(total > least, sums / total.clamp_min(least.item<float>()), torch::zeros_like(sums));
+  const torch::Tensor least = (kThreshold * total.detach().max()).clamp_min(1e-12);
+  return torch::where(total > least, sums / total.clamp_min(least.item<double>()), torch::zeros_like(sums));
 }
 
 torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const SliceAcquisition& acquisition,
@@ -81,13 +85,17 @@ torch::Tensor solve_weighted_inverse(const torch::Tensor& slices, const SliceAcq
     throw std::invalid_argument(std::string(function) + ": iterations and tolerance must not be negative, got " +
                                 std::to_string(options.iterations) + " and " + std::to_string(options.tolerance));
   }
-  check_start(start, acquisition, function);
-  check_slices(slices, acquisition, function);
-  const torch::Tensor w = checked_weights(weights, slices.size(0), function);
-  const torch::NoGradGuard no_grad;
+  check_problem(slices, acquisition, weights, start, function);
+  const bool records =
+      torch::GradMode::is_enabled() && (slices.requires_grad() || start.requires_grad() ||
+                                        acquisition.requires_grad() || (weights.defined() && weights.requires_grad()));
   // A^T W A x = A^T W y
-  const torch::Tensor b = acquisition.adjoint(weighted(slices, w), /*equalize=*/false);
-  const auto apply = [&, of_slices = flat(w)](const torch::Tensor& x) { return acquisition.normal(x, of_slices); };
+  const auto apply = [&](const torch::Tensor& x) { return acquisition.normal(x, weights); };
+  const torch::Tensor b = acquisition.adjoint(weighted(slices, weights), /*equalize=*/false);
+  if (records || !start.device().is_cpu() || start.scalar_type() != torch::kFloat32) {
+    return unrolled_conjugate_gradient(apply, b, start, options, report).clamp_min(0);
+  }
+  const torch::NoGradGuard no_grad;
   return conjugate_gradient(apply, b, start, options, report).clamp_min_(0);
 }
 
@@ -99,14 +107,15 @@ torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const SliceAcq
     throw std::invalid_argument(std::string(function) +
                                 ": iterations and strength must not be negative, step and edge must be positive");
   }
-  check_start(start, acquisition, function);
-  check_slices(slices, acquisition, function);
-  const torch::Tensor w = checked_weights(weights, slices.size(0), function);
+  check_problem(slices, acquisition, weights, start, function);
+  if (!start.device().is_cpu() || start.scalar_type() != torch::kFloat32) {
+    throw std::invalid_argument(std::string(function) + ": the operator must be float32 on the CPU");
+  }
   const torch::NoGradGuard no_grad;
   torch::Tensor x = start.detach().clone(torch::MemoryFormat::Contiguous);
   for (int i = 0; i < options.iterations; ++i) {
     const torch::Tensor error = acquisition.forward(x) - slices;
-    torch::Tensor gradient = acquisition.adjoint(weighted(error, w), /*equalize=*/false);
+    torch::Tensor gradient = acquisition.adjoint(weighted(error, weights), /*equalize=*/false);
     add_edge_prior_gradient(x, options.edge, options.strength * options.edge * options.edge, &gradient);
     x.sub_(gradient * options.step);
   }

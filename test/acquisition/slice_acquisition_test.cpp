@@ -249,7 +249,9 @@ TEST_F(AcquisitionOperator, RejectsWhatDoesNotFit) {
     EXPECT_NE(message.find(name), std::string::npos) << message;
   };
   names(with([](auto* g) { g->transforms = torch::zeros({2, 4, 4}); }), "geometry.transforms");
-  names(with([](auto* g) { g->transforms = g->transforms.to(torch::kFloat64); }), "geometry.transforms");
+  names(with([](auto* g) { g->transforms = g->transforms.to(torch::kInt64); }), "geometry.transforms");
+  names(with([](auto* g) { g->transforms = g->transforms.to(torch::kFloat64); }),
+        "volume must be 12 x 12 x 12, Double");
   names(with([](auto* g) { g->transforms = torch::full({2, 3, 4}, NAN); }), "not finite");
   names(with([](auto* g) { g->psf = torch::ones({3, 3}); }), "geometry.psf");
   names(with([](auto* g) { g->psf = torch::Tensor(); }), "undefined");

@@ -18,7 +18,7 @@ struct AcquisitionMasks {
 /// Geometry shared by the acquisition operator and its adjoint. Works in voxels.
 struct AcquisitionGeometry {
   torch::Tensor transforms;       ///< n x 3 x 4, trans_first, translation in voxels: slice coordinates -> volume
-  torch::Tensor psf;              ///< z x y x x, see gaussian_psf; or m x z x y x x, stacked by stack_psfs
+  torch::Tensor psf;              ///< z x y x x, float32, see gaussian_psf; or m x z x y x x, stacked by stack_psfs
   double resolution_ratio = 1.0;  ///< slice pixel / voxel size
   torch::Tensor psf_of_slice{};   ///< n, int64: which of the m each slice has; undefined if psf is a single one
 };
@@ -36,6 +36,8 @@ const char* to_string(AcquisitionFormulation formulation);
 /// @throws std::invalid_argument unless `name` is "exact" or "fast"
 AcquisitionFormulation acquisition_formulation(const std::string& name);
 
+class AcquisitionPlan;
+
 /// A = D B T of the paper (sec. 2) for one set of slices, its adjoint and the normal operator.
 ///
 /// A pixel is the PSF-weighted mean of the volume (trilinear), normalised by the PSF weight that falls inside the
@@ -43,8 +45,17 @@ AcquisitionFormulation acquisition_formulation(const std::string& name);
 /// that it interpolates between exist.
 ///
 /// What the calls share (pixels to work on, their weights, the split of the work) is computed once, by the constructor.
-/// All results are the same bytes for any number of threads, detached from any graph. Copies share their data; all
-/// members are safe to call from several threads.
+/// All results are the same bytes for any number of threads. Copies share their data; all members are safe to call from
+/// several threads.
+///
+/// Type and device are those of geometry.transforms, for volumes, slices, weights and results alike: float32 on the CPU
+/// (vectorised), float64 on the CPU (pixel by pixel, about ten times slower: for checks of gradients), or float32 on a
+/// CUDA device if the package was built with SVORT_WITH_CUDA.
+///
+/// forward(), adjoint() and normal() are part of the graph of their arguments and of geometry.transforms where those
+/// require gradients, and cost what they cost without gradients where none does. The gradient of a pose is the slope of
+/// the trilinear interpolation at every tap; it knows nothing of the jumps when a tap crosses the border of the volume,
+/// or when a pixel's weight passes 0 or 0.5. Second derivatives are not defined.
 class SliceAcquisition {
  public:
   /// @param height, width  slice size in pixels
@@ -56,8 +67,8 @@ class SliceAcquisition {
                    const AcquisitionMasks& masks = {});
 
   /// A x: the slices that the scanner would see.
-  /// @param volume x, D x H x W, float32, CPU
-  /// @param weight if not null, receives the PSF weight inside the volume, n x 1 x h x w
+  /// @param volume x, D x H x W
+  /// @param weight if not null, receives the PSF weight inside the volume, n x 1 x h x w, detached
   /// @return n x 1 x h x w
   /// @throws std::invalid_argument if shape, type or device does not fit
   torch::Tensor forward(const torch::Tensor& volume, torch::Tensor* weight = nullptr) const;
@@ -68,20 +79,20 @@ class SliceAcquisition {
   /// volume mask suppresses voxels without changing a pixel's normalisation. So <A x, y> = <x, A^T y> holds exactly
   /// when there is no volume mask and every pixel in the slice mask has a weight of at least 0.5.
   ///
-  /// @param slices   y, n x 1 x h x w, float32, CPU
+  /// @param slices   y, n x 1 x h x w
   /// @param equalize divide each voxel by the weight it received (PSF reconstruction); otherwise the plain sum
   /// @return D x H x W; voxels that no pixel reaches are 0
   /// @throws std::invalid_argument if shape, type or device does not fit
   torch::Tensor adjoint(const torch::Tensor& slices, bool equalize) const;
 
   /// A^T W A x, in one pass over the pixels.
-  /// @param volume  x, D x H x W, float32, CPU
-  /// @param weights w, n, float32, CPU; an undefined tensor means 1
+  /// @param volume  x, D x H x W
+  /// @param weights w, n; an undefined tensor means 1
   /// @throws std::invalid_argument if shape, type or device does not fit
   torch::Tensor normal(const torch::Tensor& volume, const torch::Tensor& weights = {}) const;
 
-  /// Sums for equalized_volume(), to be added to or taken from: D x H x W x 2, float64, zero. In the last dimension the
-  /// sum of PSF weight x pixel, and the sum of PSF weights.
+  /// Sums for equalized_volume(), to be added to or taken from: D x H x W x 2, float64, zero, detached. In the last
+  /// dimension the sum of PSF weight x pixel, and the sum of PSF weights.
   torch::Tensor empty_sums() const;
 
   /// sums += factor x what these slices contribute. Adding slices and later taking the same away (factor -1) leaves
@@ -98,10 +109,16 @@ class SliceAcquisition {
   std::int64_t width() const;
   std::array<std::int64_t, 3> volume_shape() const;
   AcquisitionFormulation formulation() const;
+  /// Type and device of all volumes and slices.
+  torch::TensorOptions options() const;
+  /// Whether the poses are part of a graph.
+  bool requires_grad() const;
+
+  /// For this library's own sources and tests.
+  const AcquisitionPlan& plan() const { return *plan_; }
 
  private:
-  struct Plan;
-  std::shared_ptr<const Plan> plan_;
+  std::shared_ptr<const AcquisitionPlan> plan_;
 };
 
 /// SliceAcquisition::forward(), exact, for a single call.

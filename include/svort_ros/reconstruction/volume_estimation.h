@@ -40,8 +40,13 @@ struct ConjugateGradientReport {
 /// Solves A^T W A x = A^T W y from `start`; the result is clamped at 0, as the public implementation does. The result
 /// does not depend on the number of threads.
 ///
-/// @param slices  y, n x 1 x h x w, float32, CPU
-/// @param weights w, n, float32; an undefined tensor means 1
+/// Differentiable with respect to slices, weights, start and the operator's poses where these require gradients: the
+/// steps are unrolled, so the gradient is that of the result after so many steps (paper, sec. 2.3: training needs it in
+/// w), not of the solution. The number of steps is a constant in it, and the clamp passes nothing where it cut.
+///
+/// All tensors have the operator's type and device.
+/// @param slices  y, n x 1 x h x w
+/// @param weights w, n; an undefined tensor means 1
 /// @param start   D x H x W, usually reconstruct_psf()
 /// @throws std::invalid_argument naming the argument if a shape, type or device does not fit, an option is out of
 ///         range, or a weight is negative or not finite
@@ -62,7 +67,7 @@ struct EdgePreservingOptions {
 /// dR(x)_v = sum over the 26 neighbours u of d / sqrt(1 + (x_v - x_u) d), d = (x_v - x_u) / (|v - u|^2 delta^2).
 ///
 /// The rim of the volume, one voxel wide, has no prior. Matches the public implementation's gradient-descent mode.
-/// Arguments and errors as in solve_weighted_inverse().
+/// Arguments and errors as in solve_weighted_inverse(), but for float32 on the CPU only; the result is detached.
 torch::Tensor refine_edge_preserving(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                      const torch::Tensor& weights, const torch::Tensor& start,
                                      const EdgePreservingOptions& options);
