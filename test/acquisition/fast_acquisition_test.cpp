@@ -75,12 +75,15 @@ TEST_F(FastAcquisition, IsWithinOnePercentOfTheExactFormulation) {
     // Voxel by voxel the plain adjoint shows how taps fall between voxels; seen through A that is gone.
     const torch::Tensor plain = exact.adjoint(slices, /*equalize=*/false);
     const double seen = relative_l2(exact.forward(fast.adjoint(slices, /*equalize=*/false)), exact.forward(plain));
+    const double voxel_by_voxel = relative_l2(fast.adjoint(slices, /*equalize=*/false), plain);
     RecordProperty("forward", std::to_string(forward));
     std::cout << "ratio " << ratio << ": forward " << forward << ", equalised adjoint " << equalized
-              << ", plain adjoint seen through A " << seen << "\n";
+              << ", plain adjoint seen through A " << seen << ", voxel by voxel " << voxel_by_voxel << "\n";
     EXPECT_LT(forward, 0.01);
     EXPECT_LT(equalized, 0.01);
     EXPECT_LT(seen, 0.01);
+    // Above the 0.01 of the others, because of the exact taps: see FastAdjoint in analytic_slice_test.
+    EXPECT_LT(voxel_by_voxel, ratio == 1. ? 0.025 : 0.05);
     // What is added up is the same.
     EXPECT_NEAR(fast.adjoint(slices, false).sum().item<double>() / plain.sum().item<double>(), 1., 1e-4);
   }
