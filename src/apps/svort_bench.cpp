@@ -4,12 +4,14 @@
 #include <sys/resource.h>
 #include <torch/torch.h>
 
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cmath>
 #include <cstring>
 #include <fstream>
 #include <functional>
+#include <iomanip>
 #include <iostream>
 #include <limits>
 #include <sstream>
@@ -30,7 +32,7 @@ using svort::SliceAcquisition;
 
 constexpr const char* kUsage =
     "usage: svort_bench forward [--slices N,..] [--threads N,..] [--repetitions N] [--thickness VOXELS]\n"
-    "                           [--pixel VOXELS] [--volume D,H,W] [--plain yes|no]\n"
+    "                           [--pixel VOXELS] [--volume D,H,W] [--plain yes|no] [--table yes|no]\n"
     "Times the acquisition operator on 128 x 128 pixel slices and prints one JSON object per line.\n"
     "  --slices       numbers of slices, default 21,60,120,450\n"
     "  --threads      numbers of threads, default 1,2\n"
@@ -38,7 +40,9 @@ constexpr const char* kUsage =
     "  --thickness    slice thickness in voxels, default 3.75\n"
     "  --pixel        slice pixel in voxels, default 1.25\n"
     "  --volume       size in voxels, default 100,112,96\n"
-    "  --plain        also time the plain loop over taps that the others are compared with, default yes\n";
+    "  --plain        also time the plain loop over taps that the others are compared with, default yes\n"
+    "  --table        print the tables of docs/performance.md instead, the JSON objects to the standard error;\n"
+    "                 adds other thicknesses and volumes at the second number of slices, default no\n";
 
 struct UsageError : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -52,6 +56,7 @@ struct Options {
   double pixel = 1.25;
   std::vector<std::int64_t> volume = {100, 112, 96};
   bool plain = true;
+  bool table = false;
 };
 
 constexpr int kSize = 128;  // pixels along each side of a slice
@@ -98,9 +103,9 @@ Options parse(const std::vector<std::string>& arguments) {
       if (!(text >> number) || !text.eof() || !(number >= 0.5 && number <= 20.)) {
         throw UsageError(name + " takes a number from 0.5 to 20, got '" + value + "'");
       }
-    } else if (name == "--plain") {
-      if (value != "yes" && value != "no") throw UsageError("--plain takes yes or no, got '" + value + "'");
-      options.plain = value == "yes";
+    } else if (name == "--plain" || name == "--table") {
+      if (value != "yes" && value != "no") throw UsageError(name + " takes yes or no, got '" + value + "'");
+      (name == "--plain" ? options.plain : options.table) = value == "yes";
     } else {
       throw UsageError(name + " is unknown");
     }
@@ -278,78 +283,173 @@ struct Timing {
   double forward_ms = 0., adjoint_ms = 0., equalized_ms = 0., iteration_ms = 0.;
 };
 
-void run(const Options& options) {
+// One line of a table.
+struct Row {
+  std::string formulation;
+  std::int64_t slices = 0, threads = 1;
+  double thickness = 0.;
+  std::vector<std::int64_t> volume;
+  std::size_t taps = 0;
+  Timing time, plain;  // plain: of the same slices; 0 if it was not measured
+  double over_copy = 0., peak_mb = 0.;
+};
+
+// Times all formulations and numbers of threads for `n` slices; one JSON object per line to `log`.
+std::vector<Row> measure(const Options& options, std::int64_t n, double bandwidth, std::ostream& log) {
   const torch::NoGradGuard no_grad;
   const std::array<std::int64_t, 3> shape = {options.volume[0], options.volume[1], options.volume[2]};
   const double voxels = static_cast<double>(shape[0] * shape[1] * shape[2]);
-  const double bandwidth = copy_gb_per_s();
   const torch::Tensor volume = test_volume(options.volume);
-  for (const std::int64_t n : options.slices) {
-    const AcquisitionGeometry geometry = moved_stacks(n, options.pixel, options.thickness);
-    const PlainLoop plain(geometry, options.volume);
-    const double pixels = static_cast<double>(n) * kSize * kSize;
-    Timing plain_time;
-    torch::Tensor plain_slices, plain_adjoint;
-    const auto head = [&](const std::string& formulation, std::int64_t threads) {
-      std::ostringstream line;
-      line << R"({"benchmark": "forward", "formulation": ")" << formulation << R"(", "slices": )" << n
-           << R"(, "pixels": [128, 128], "pixel_voxels": )" << options.pixel << R"(, "volume": [)" << shape[0] << ", "
-           << shape[1] << ", " << shape[2] << R"(], "thickness_voxels": )" << options.thickness << R"(, "psf_taps": )"
-           << plain.tap_count() << R"(, "threads": )" << threads;
-      return line.str();
-    };
-    // Voxels of the cells that all taps of the PSF would read, whatever the formulation: work done per second.
-    const auto gigabytes = [&](double ms) {
-      return pixels * static_cast<double>(plain.tap_count()) * 8. * sizeof(float) / ms / 1e6;
-    };
-    if (options.plain) {
-      // Long enough to need no repetition.
-      plain_time.forward_ms = best_ms(1, [&] { plain_slices = plain.forward(volume); });
-      plain_time.adjoint_ms = best_ms(1, [&] { plain_adjoint = plain.adjoint(plain_slices); });
-      plain_time.iteration_ms = plain_time.forward_ms + plain_time.adjoint_ms;  // without its vector operations
-      std::cout << head("plain", 1) << R"(, "forward_ms": )" << plain_time.forward_ms << R"(, "adjoint_ms": )"
-                << plain_time.adjoint_ms << R"(, "cg_iteration_ms": )" << plain_time.iteration_ms
-                << R"(, "forward_gb_per_s": )" << gigabytes(plain_time.forward_ms) << "}" << std::endl;
-    }
-    for (const AcquisitionFormulation formulation : {AcquisitionFormulation::exact, AcquisitionFormulation::fast}) {
-      for (const std::int64_t threads : options.threads) {
-        at::set_num_threads(static_cast<int>(threads));
-        reset_peak_memory();
-        const double setup_ms = best_ms(
-            options.repetitions, [&] { const SliceAcquisition once(geometry, kSize, kSize, shape, formulation); });
-        const SliceAcquisition acquisition(geometry, kSize, kSize, shape, formulation);
-        Timing time;
-        torch::Tensor slices, back, equalized;
-        time.forward_ms = best_ms(options.repetitions, [&] { slices = acquisition.forward(volume); });
-        time.adjoint_ms = best_ms(options.repetitions, [&] { back = acquisition.adjoint(slices, false); });
-        time.equalized_ms = best_ms(options.repetitions, [&] { equalized = acquisition.adjoint(slices, true); });
-        // Differences of two solves: the start costs one more application and the right side.
-        const auto solve = [&](int iterations) {
-          svort::ConjugateGradientOptions cg;
-          cg.iterations = iterations;
-          return best_ms(std::max<std::int64_t>(1, options.repetitions / 2),
-                         [&] { svort::solve_weighted_inverse(slices, acquisition, {}, equalized, cg); });
-        };
-        time.iteration_ms = (solve(4) - solve(0)) / 4.;
-        // The least that memory allows: the volume read, the slices written, once each.
-        const double floor_ms = (voxels + pixels) * sizeof(float) / bandwidth / 1e6;
-        std::cout << head(svort::to_string(formulation), threads) << R"(, "setup_ms": )" << setup_ms
-                  << R"(, "forward_ms": )" << time.forward_ms << R"(, "adjoint_ms": )" << time.adjoint_ms
-                  << R"(, "equalized_adjoint_ms": )" << time.equalized_ms << R"(, "cg_iteration_ms": )"
-                  << time.iteration_ms << R"(, "forward_gb_per_s": )" << gigabytes(time.forward_ms)
-                  << R"(, "copy_gb_per_s": )" << bandwidth << R"(, "forward_over_copy_time": )"
-                  << time.forward_ms / floor_ms << R"(, "peak_memory_mb": )" << peak_memory_mb();
-        if (options.plain) {
-          std::cout << R"(, "forward_speedup": )" << plain_time.forward_ms / time.forward_ms
-                    << R"(, "adjoint_speedup": )" << plain_time.adjoint_ms / time.adjoint_ms
-                    << R"(, "cg_iteration_speedup": )" << plain_time.iteration_ms / time.iteration_ms
-                    << R"(, "forward_error": )" << relative_l2(slices, plain_slices) << R"(, "adjoint_error": )"
-                    << relative_l2(back, plain_adjoint);
-        }
-        std::cout << "}" << std::endl;
+  const AcquisitionGeometry geometry = moved_stacks(n, options.pixel, options.thickness);
+  const PlainLoop plain(geometry, options.volume);
+  const double pixels = static_cast<double>(n) * kSize * kSize;
+  std::vector<Row> rows;
+  Row row;
+  row.slices = n;
+  row.thickness = options.thickness;
+  row.volume = options.volume;
+  row.taps = plain.tap_count();
+  torch::Tensor plain_slices, plain_adjoint;
+  const auto head = [&] {
+    std::ostringstream line;
+    line << R"({"benchmark": "forward", "formulation": ")" << row.formulation << R"(", "slices": )" << n
+         << R"(, "pixels": [128, 128], "pixel_voxels": )" << options.pixel << R"(, "volume": [)" << shape[0] << ", "
+         << shape[1] << ", " << shape[2] << R"(], "thickness_voxels": )" << options.thickness << R"(, "psf_taps": )"
+         << row.taps << R"(, "threads": )" << row.threads;
+    return line.str();
+  };
+  // Voxels of the cells that all taps of the PSF would read, whatever the formulation: work done per second.
+  const auto gigabytes = [&](double ms) {
+    return pixels * static_cast<double>(row.taps) * 8. * sizeof(float) / ms / 1e6;
+  };
+  if (options.plain) {
+    // Long enough to need no repetition.
+    row.formulation = "plain";
+    row.time.forward_ms = best_ms(1, [&] { plain_slices = plain.forward(volume); });
+    row.time.adjoint_ms = best_ms(1, [&] { plain_adjoint = plain.adjoint(plain_slices); });
+    row.time.iteration_ms = row.time.forward_ms + row.time.adjoint_ms;  // without its vector operations
+    row.plain = row.time;
+    log << head() << R"(, "forward_ms": )" << row.time.forward_ms << R"(, "adjoint_ms": )" << row.time.adjoint_ms
+        << R"(, "cg_iteration_ms": )" << row.time.iteration_ms << R"(, "forward_gb_per_s": )"
+        << gigabytes(row.time.forward_ms) << "}" << std::endl;
+    rows.push_back(row);
+  }
+  for (const AcquisitionFormulation formulation : {AcquisitionFormulation::exact, AcquisitionFormulation::fast}) {
+    for (const std::int64_t threads : options.threads) {
+      at::set_num_threads(static_cast<int>(threads));
+      reset_peak_memory();
+      row.formulation = svort::to_string(formulation);
+      row.threads = threads;
+      const double setup_ms = best_ms(options.repetitions,
+                                      [&] { const SliceAcquisition once(geometry, kSize, kSize, shape, formulation); });
+      const SliceAcquisition acquisition(geometry, kSize, kSize, shape, formulation);
+      Timing& time = row.time;
+      torch::Tensor slices, back, equalized;
+      time.forward_ms = best_ms(options.repetitions, [&] { slices = acquisition.forward(volume); });
+      time.adjoint_ms = best_ms(options.repetitions, [&] { back = acquisition.adjoint(slices, false); });
+      time.equalized_ms = best_ms(options.repetitions, [&] { equalized = acquisition.adjoint(slices, true); });
+      // Differences of two solves: the start costs one more application and the right side.
+      const auto solve = [&](int iterations) {
+        svort::ConjugateGradientOptions cg;
+        cg.iterations = iterations;
+        return best_ms(std::max<std::int64_t>(1, options.repetitions / 2),
+                       [&] { svort::solve_weighted_inverse(slices, acquisition, {}, equalized, cg); });
+      };
+      time.iteration_ms = (solve(4) - solve(0)) / 4.;
+      // The least that memory allows: the volume read, the slices written, once each.
+      row.over_copy = time.forward_ms / ((voxels + pixels) * sizeof(float) / bandwidth / 1e6);
+      row.peak_mb = peak_memory_mb();
+      log << head() << R"(, "setup_ms": )" << setup_ms << R"(, "forward_ms": )" << time.forward_ms
+          << R"(, "adjoint_ms": )" << time.adjoint_ms << R"(, "equalized_adjoint_ms": )" << time.equalized_ms
+          << R"(, "cg_iteration_ms": )" << time.iteration_ms << R"(, "forward_gb_per_s": )"
+          << gigabytes(time.forward_ms) << R"(, "copy_gb_per_s": )" << bandwidth << R"(, "forward_over_copy_time": )"
+          << row.over_copy << R"(, "peak_memory_mb": )" << row.peak_mb;
+      if (options.plain) {
+        log << R"(, "forward_speedup": )" << row.plain.forward_ms / time.forward_ms << R"(, "adjoint_speedup": )"
+            << row.plain.adjoint_ms / time.adjoint_ms << R"(, "cg_iteration_speedup": )"
+            << row.plain.iteration_ms / time.iteration_ms << R"(, "forward_error": )"
+            << relative_l2(slices, plain_slices) << R"(, "adjoint_error": )" << relative_l2(back, plain_adjoint);
       }
+      log << "}" << std::endl;
+      rows.push_back(row);
     }
   }
+  return rows;
+}
+
+// Markdown. @param with_size whether thickness and volume differ from row to row
+void print_table(const std::vector<Row>& rows, bool with_size, std::ostream& out) {
+  const auto number = [](double value) {
+    std::ostringstream text;
+    text << std::fixed << std::setprecision(value < 10. ? 1 : 0) << value;
+    return text.str();
+  };
+  const auto cell = [&](double ms, double plain_ms) {
+    return plain_ms > 0. && ms != plain_ms ? number(ms) + " (" + number(plain_ms / ms) + ")" : number(ms);
+  };
+  out << (with_size ? "| thickness | volume | taps | threads | formulation" : "| slices | threads | formulation")
+      << " | A, ms | adjoint, ms | CG step, ms | A over copy | peak, MB |\n"
+      << (with_size ? "|---|---" : "") << "|---|---|---|---|---|---|---|---|\n";
+  for (const Row& row : rows) {
+    if (with_size) {
+      out << "| " << row.thickness << " | " << row.volume[0] << " x " << row.volume[1] << " x " << row.volume[2]
+          << " | " << row.taps;
+    } else {
+      out << "| " << row.slices;
+    }
+    out << " | " << row.threads << " | " << row.formulation << " | " << cell(row.time.forward_ms, row.plain.forward_ms)
+        << " | " << cell(row.time.adjoint_ms, row.plain.adjoint_ms) << " | "
+        << cell(row.time.iteration_ms, row.plain.iteration_ms) << " | "
+        << (row.over_copy > 0. ? number(row.over_copy) : "-") << " | " << (row.peak_mb > 0. ? number(row.peak_mb) : "-")
+        << " |\n";
+  }
+}
+
+std::string processor() {
+  std::ifstream file("/proc/cpuinfo");
+  for (std::string line; std::getline(file, line);) {
+    const std::size_t colon = line.find(": ");
+    if (line.rfind("model name", 0) == 0 && colon != std::string::npos) return line.substr(colon + 2);
+  }
+  return "unknown processor";
+}
+
+void run(const Options& options) {
+  const double bandwidth = copy_gb_per_s();
+  std::ostream& log = options.table ? std::cerr : std::cout;
+  std::vector<Row> by_slices;
+  for (const std::int64_t n : options.slices) {
+    const std::vector<Row> rows = measure(options, n, bandwidth, log);
+    by_slices.insert(by_slices.end(), rows.begin(), rows.end());
+  }
+  if (!options.table) return;
+  const std::int64_t n = options.slices[std::min<std::size_t>(1, options.slices.size() - 1)];
+  std::vector<Row> by_size;
+  const auto add = [&](const Options& changed) {
+    const std::vector<Row> rows = measure(changed, n, bandwidth, log);
+    by_size.insert(by_size.end(), rows.begin(), rows.end());
+  };
+  Options changed = options;
+  changed.plain = false;
+  for (const double thickness : {1., 2., 3.75, 5., 8.}) {
+    changed.thickness = thickness;
+    add(changed);
+  }
+  changed.thickness = options.thickness;
+  for (const std::int64_t percent : {50, 75, 150}) {
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+      changed.volume[axis] = std::max<std::int64_t>(1, options.volume[axis] * percent / 100);
+    }
+    add(changed);
+  }
+  std::cout
+      << processor() << ", a plain copy moves " << std::fixed << std::setprecision(1) << bandwidth
+      << " GB/s. In brackets: times faster than the plain loop of the same slices. \"A over copy\": times what it\n"
+      << "takes to read the volume and write the slices once at that rate.\n\n"
+      << std::defaultfloat;
+  print_table(by_slices, /*with_size=*/false, std::cout);
+  std::cout << "\n" << n << " slices:\n\n";
+  print_table(by_size, /*with_size=*/true, std::cout);
 }
 
 }  // namespace
