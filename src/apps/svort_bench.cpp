@@ -446,7 +446,7 @@ void run(const Options& options) {
       << processor() << ", a plain copy moves " << std::fixed << std::setprecision(1) << bandwidth
       << " GB/s. In brackets: times faster than the plain loop of the same slices. \"A over copy\": times what it\n"
       << "takes to read the volume and write the slices once at that rate.\n\n"
-      << std::defaultfloat;
+      << std::defaultfloat << std::setprecision(6);
   print_table(by_slices, /*with_size=*/false, std::cout);
   std::cout << "\n" << n << " slices:\n\n";
   print_table(by_size, /*with_size=*/true, std::cout);
