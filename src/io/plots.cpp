@@ -366,4 +366,83 @@ void plot_latency(const std::filesystem::path& path, const Journal& journal) {
   write_png(path, image);
 }
 
+// ---- curves ---------------------------------------------------------------------------------------------------------
+
+namespace {
+
+/// A step of 1, 2 or 5 times a power of ten that divides 0 .. `largest` into five to ten parts or so.
+double tick_step(double largest) {
+  const double decade = std::pow(10., std::floor(std::log10(largest)));
+  for (const double factor : {0.1, 0.2, 0.5})
+    if (largest / (factor * decade) <= 10.) return factor * decade;
+  return decade;
+}
+
+std::string number_label(double value) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%.6g", value);
+  return text;
+}
+
+}  // namespace
+
+void plot_curves(const std::filesystem::path& path, const std::string& title, const std::string& x_label,
+                 const std::string& y_label, const std::vector<Curve>& curves) {
+  std::vector<double> heights;
+  double x_end = 0.;
+  for (const Curve& curve : curves) {
+    for (const auto& [x, y] : curve.points) {
+      if (!std::isfinite(x) || !std::isfinite(y)) continue;
+      x_end = std::max(x_end, x);
+      heights.push_back(y);
+    }
+  }
+  std::sort(heights.begin(), heights.end());
+  double y_end = heights.empty() ? 1. : 1.05 * heights[(heights.size() - 1) * 98 / 100];
+  if (!(y_end > 0.)) y_end = 1.;
+  if (!(x_end > 0.)) x_end = 1.;
+
+  cv::Mat image(720, 1500, CV_8UC3, kWhite);
+  const cv::Rect frame(96, 92, 1374, 550);
+  const int right = frame.x + frame.width;
+  const int bottom = frame.y + frame.height;
+  const auto at = [&](double x, double y) {
+    return cv::Point(frame.x + static_cast<int>(std::lround(x / x_end * frame.width)),
+                     bottom - static_cast<int>(std::lround(std::clamp(y / y_end, 0., 1.) * frame.height)));
+  };
+  for (double y = 0.; y <= y_end; y += tick_step(y_end)) {
+    cv::line(image, at(0., y), {right, at(0., y).y}, kGrid, 1);
+    put_text(image, number_label(y), at(0., y) + cv::Point(-10, 6), 0.5, kInk, Align::right);
+  }
+  for (double x = 0.; x <= x_end; x += tick_step(x_end)) {
+    cv::line(image, {at(x, 0.).x, bottom}, {at(x, 0.).x, bottom + 6}, kInk, 1);
+    put_text(image, number_label(x), {at(x, 0.).x, bottom + 26}, 0.5, kInk, Align::centre);
+  }
+  cv::rectangle(image, frame, kInk, 1);
+  put_text(image, ascii(title, 100), {frame.x, 36}, 0.75, kInk);
+  put_text(image, ascii(x_label, 80), {frame.x + frame.width / 2, bottom + 54}, 0.6, kInk, Align::centre);
+  cv::Mat label(30, 400, CV_8UC3, kWhite);
+  put_text(label, ascii(y_label, 40), {200, 20}, 0.6, kInk, Align::centre);
+  cv::rotate(label, label, cv::ROTATE_90_COUNTERCLOCKWISE);
+  label.copyTo(image(cv::Rect(8, frame.y + frame.height / 2 - 200, label.cols, label.rows)));
+
+  const std::array<cv::Scalar, 6> colours = {
+      kBlue, kOrange, kRed, cv::Scalar(115, 158, 0), cv::Scalar(167, 121, 204), cv::Scalar(100, 100, 100)};
+  int legend = frame.x + 6;
+  for (std::size_t i = 0; i < curves.size(); ++i) {
+    const cv::Scalar& colour = colours[i % colours.size()];
+    std::vector<cv::Point> line;
+    for (const auto& [x, y] : curves[i].points)
+      if (std::isfinite(x) && std::isfinite(y)) line.push_back(at(x, y));
+    cv::polylines(image, line, false, colour, 2, cv::LINE_AA);
+    if (line.size() == 1) draw_dot(image, line.front(), colour);
+    const std::string name = ascii(curves[i].name, 40);
+    cv::line(image, {legend, 70}, {legend + 30, 70}, colour, 3);
+    put_text(image, name, {legend + 38, 76}, 0.52, kInk);
+    int baseline = 0;
+    legend += 38 + cv::getTextSize(name, cv::FONT_HERSHEY_SIMPLEX, 0.52, 1, &baseline).width + 34;
+  }
+  write_png(path, image);
+}
+
 }  // namespace svort

@@ -134,5 +134,18 @@ TEST_F(Plots, SameBytesForTheSameInput) {
   EXPECT_EQ(read(path("c.png")), read(path("d.png")));
 }
 
+TEST_F(Plots, CurvesLieWhereTheirValuesSay) {
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  plot_curves(path("c.png"), "title", "step", "loss", {{"flat", {{0., 2.}, {5., nan}, {10., 2.}}}, {"empty", {}}});
+  const cv::Mat image = cv::imread(path("c.png").string());
+  ASSERT_EQ(image.size(), cv::Size(1500, 720));
+  // One value, so the axis ends 5 % above it: the line is 1 / 1.05 of the frame's height above its lower edge.
+  const int y = 92 + 550 - static_cast<int>(std::lround(550. / 1.05));
+  const cv::Vec3b on = image.at<cv::Vec3b>(y, 700), off = image.at<cv::Vec3b>(y + 12, 700);
+  EXPECT_GT(on[0] - on[2], 100);  // blue
+  EXPECT_LT(std::abs(off[0] - off[2]), 20);
+  EXPECT_THROW(plot_curves(path("missing/c.png"), "", "", "", {}), std::runtime_error);
+}
+
 }  // namespace
 }  // namespace svort

@@ -2,6 +2,8 @@
 
 #include <filesystem>
 #include <string>
+#include <utility>
+#include <vector>
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/live/journal.h"
@@ -15,5 +17,16 @@ void plot_volume_views(const std::filesystem::path& path, const Volume& volume, 
 /// PNG with latency (ms) per arrival: pose and volume, against the repetition time found in the stamps.
 /// @throws std::runtime_error naming the file
 void plot_latency(const std::filesystem::path& path, const Journal& journal);
+
+/// One line of plot_curves(). Points that are not finite are left out.
+struct Curve {
+  std::string name;
+  std::vector<std::pair<double, double>> points;  ///< x, y; x ascending
+};
+
+/// PNG with curves over a common x axis, both axes from 0; what lies above the 0.98 quantile of all y is cut off.
+/// @throws std::runtime_error naming the file
+void plot_curves(const std::filesystem::path& path, const std::string& title, const std::string& x_label,
+                 const std::string& y_label, const std::vector<Curve>& curves);
 
 }  // namespace svort

@@ -1,0 +1,110 @@
+#pragma once
+
+#include <torch/torch.h>
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "svort_ros/network/baselines.h"
+#include "svort_ros/network/live_network.h"
+#include "svort_ros/network/pose_network.h"
+#include "svort_ros/simulation/scan_simulator.h"
+
+namespace svort {
+
+/// Loss of one step: what is minimised, and its parts for the log.
+struct StepLoss {
+  torch::Tensor total;                  ///< scalar with a graph
+  std::map<std::string, double> parts;  ///< by name; a part that did not occur in this step is not there
+};
+
+/// How a network is trained: from scans to a loss. One per kind of network.
+class TrainingRecipe {
+ public:
+  virtual ~TrainingRecipe() = default;
+  virtual PoseNetwork& network() = 0;
+  /// Names of all parts that loss() may report, in the order of the log's columns.
+  virtual std::vector<std::string> parts() const = 0;
+  /// @param scans at least one, none without slices
+  /// @param step  number of the step: what is random in the recipe depends on it and the seed alone
+  virtual StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) = 0;
+};
+
+/// How the live network is trained.
+struct LiveRecipeOptions {
+  double first_share = 0.8;          ///< share of steps that train the first network; the others the shared one
+  double beta = 0.5;                 ///< where smooth L1 becomes linear, in the outputs' own units (50 and 10 mm)
+  double mirror_weight = 1.;         ///< of the mirror head's loss
+  double scale_weight = 0.05;        ///< of the loss of the expected error
+  double quality_weight = 0.05;      ///< of the loss of the slice's weight
+  double unmoved_share = 0.5;        ///< share of scans that start as the first network leaves them, with their motion
+  double perturb_deg = 8.;           ///< rotation of perturbed slices, per axis, at most, degrees
+  double perturb_mm = 6.;            ///< displacement of perturbed slices, per axis, at most, mm
+  double global_deg = 6.;            ///< rotation of the whole start, per axis, degrees
+  double global_mm = 3.;             ///< displacement of the whole start, per axis, mm
+  double second_update_share = 0.3;  ///< share of steps that make one update without gradient before the one with
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v("first_share", first_share, "share of steps that train the first network; the others train the shared one");
+    v("beta", beta, "where smooth L1 becomes linear, in the outputs' units (50 mm first, 10 mm shared network)");
+    v("mirror_weight", mirror_weight, "weight of the mirror head's loss");
+    v("scale_weight", scale_weight, "weight of the loss of the expected error");
+    v("quality_weight", quality_weight, "weight of the loss of the slices' quality");
+    v("unmoved_share", unmoved_share,
+      "share of warm starts that still have the scan's motion; others are perturbed truth");
+    v("perturb_deg", perturb_deg, "largest rotation of perturbed slices, per axis, degrees");
+    v("perturb_mm", perturb_mm, "largest displacement of perturbed slices, per axis, mm");
+    v("global_deg", global_deg, "rotation of the whole start, standard deviation per axis, degrees");
+    v("global_mm", global_mm, "displacement of the whole start, standard deviation per axis, mm");
+    v("second_update_share", second_update_share, "share of steps with one update before the one that has a gradient");
+  }
+};
+
+/// Live recipe: smooth L1 on anchor points, a mirror head that may be wrong by a reflection, and warm starts.
+///
+/// A step trains either the first network, or one random iteration of the shared network: from places as the first
+/// network leaves them (one head pose for the scan, its motion not yet known) or from the truth, perturbed, after
+/// no or one update without gradient. The volume is the PSF reconstruction at those places, without gradient.
+class LiveRecipe : public TrainingRecipe {
+ public:
+  /// @throws std::invalid_argument naming the option that is out of range
+  LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOptions& options, std::uint64_t seed);
+
+  PoseNetwork& network() override { return *network_; }
+  std::vector<std::string> parts() const override;
+  StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
+
+ private:
+  torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index) const;
+  StepLoss first_loss(const NetworkInput& input, const torch::Tensor& truth, const torch::Tensor& good,
+                      const std::vector<std::int64_t>& lengths);
+  StepLoss shared_loss(const std::vector<SimulatedScan>& scans, NetworkInput input, const torch::Tensor& truth,
+                       const torch::Tensor& good, const std::vector<std::int64_t>& lengths, std::uint64_t step);
+
+  std::shared_ptr<LiveNetwork> network_;
+  LiveRecipeOptions options_;
+  std::uint64_t seed_;
+};
+
+/// The paper's recipe for its baselines: squared distance of the anchor points.
+class AnchorRecipe : public TrainingRecipe {
+ public:
+  explicit AnchorRecipe(std::shared_ptr<AnchorRegressor> network) : network_(std::move(network)) {}
+
+  PoseNetwork& network() override { return *network_; }
+  std::vector<std::string> parts() const override { return {"points"}; }
+  StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
+
+ private:
+  std::shared_ptr<AnchorRegressor> network_;
+};
+
+/// Several scans as one input, one after another. `slice_resolution_mm` must agree; `thickness_mm` and `common_frame`
+/// are those of the first.
+NetworkInput concatenate(const std::vector<const NetworkInput*>& inputs);
+
+}  // namespace svort

@@ -1,0 +1,289 @@
+#include "svort_ros/training/trainer.h"
+
+#include <gtest/gtest.h>
+#include <torch/torch.h>
+
+#include <cmath>
+#include <filesystem>
+#include <fstream>
+#include <limits>
+#include <string>
+
+#include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/training/losses.h"
+
+namespace {
+
+using namespace svort;
+
+// ---------------------------------------------------------------------------------------------------------- losses
+
+TEST(Losses, SmoothL1IsQuadraticThenLinear) {
+  const torch::Tensor truth = torch::zeros({2, 9});
+  torch::Tensor points = torch::zeros({2, 9});
+  points[0] = 0.25;
+  points[1] = -2.;
+  const torch::Tensor loss = smooth_l1_loss(points, truth, 0.5);
+  EXPECT_NEAR(loss[0].item<double>(), 0.25 * 0.25, 1e-6);  // x^2 / (2 beta)
+  EXPECT_NEAR(loss[1].item<double>(), 2. - 0.25, 1e-6);    // |x| - beta / 2
+}
+
+TEST(Losses, AMirroredAnswerCostsTheMirrorLossNothing) {
+  torch::manual_seed(1);
+  const torch::Tensor truth = torch::randn({4, 9});
+  torch::Tensor mirrored = truth.clone();
+  for (const int x : {0, 3, 6}) mirrored.select(1, x) *= -1.;
+  EXPECT_LT(mirror_loss(mirrored, truth, 0.5).max().item<float>(), 1e-6F);
+  EXPECT_LT(mirror_loss(truth, truth, 0.5).max().item<float>(), 1e-6F);
+  EXPECT_GT(smooth_l1_loss(mirrored, truth, 0.5).min().item<float>(), 1e-3F);
+  // Neither reading fits if only one point is reflected.
+  torch::Tensor torn = truth.clone();
+  torn.select(1, 0) *= -1.;
+  EXPECT_GT(mirror_loss(torn, truth, 0.5).min().item<float>(), 1e-4F);
+}
+
+TEST(Losses, TheScaleThatCostsLeastIsTheErrorItself) {
+  const torch::Tensor errors = torch::full({1}, 0.3, torch::requires_grad());
+  torch::Tensor log_scale = torch::full({1}, std::log(0.3F), torch::requires_grad());
+  scale_loss(errors, log_scale).sum().backward();
+  EXPECT_NEAR(log_scale.grad().item<double>(), 0., 1e-6);
+  EXPECT_FALSE(errors.grad().defined());
+}
+
+TEST(Losses, ThePapersLossIsTheSquaredDistance) {
+  EXPECT_NEAR(anchor_loss(torch::full({1, 9}, 3.), torch::zeros({1, 9})).item<double>(), 9., 1e-5);
+}
+
+// ---------------------------------------------------------------------------------------------------------- trainer
+
+LiveNetworkOptions small_network() {
+  LiveNetworkOptions options;
+  options.width = 8;
+  options.dim = 24;
+  options.heads = 2;
+  options.layers = 1;
+  options.hidden = 24;
+  return options;
+}
+
+std::shared_ptr<ScanSimulator> simulator(std::uint64_t seed = 1) {
+  static const BrainVolume phantom = [] {
+    PhantomOptions options;
+    options.resolution_mm = 2.;
+    return make_phantom(options);
+  }();
+  SimulatorOptions options;
+  options.anatomies = 1;
+  options.scanner.stacks_min = options.scanner.stacks_max = 1;
+  return std::make_shared<ScanSimulator>(std::vector<BrainVolume>{phantom}, NetworkGrid{{64, 64, 64}, 2.}, options,
+                                         seed);
+}
+
+TrainerOptions quick() {
+  TrainerOptions options;
+  options.scans_per_step = 2;
+  options.warmup_steps = 2;
+  options.log_steps = 1;
+  return options;
+}
+
+class TrainerTest : public ::testing::Test {
+ protected:
+  void SetUp() override {
+    const auto* info = ::testing::UnitTest::GetInstance()->current_test_info();
+    folder_ = std::filesystem::temp_directory_path() / ("svort_trainer_test_" + std::string(info->name()));
+    std::filesystem::remove_all(folder_);
+  }
+  void TearDown() override { std::filesystem::remove_all(folder_); }
+
+  static std::shared_ptr<LiveRecipe> recipe(double first_share = 0.5) {
+    torch::manual_seed(7);
+    LiveRecipeOptions options;
+    options.first_share = first_share;
+    return std::make_shared<LiveRecipe>(std::make_shared<LiveNetwork>(small_network()), options, 1);
+  }
+  std::vector<std::string> lines(const char* file) const {
+    std::ifstream stream(folder_ / file);
+    std::vector<std::string> result;
+    for (std::string line; std::getline(stream, line);) result.push_back(line);
+    return result;
+  }
+
+  std::filesystem::path folder_;
+};
+
+bool same_weights(const Trainer& a, const Trainer& b) {
+  const auto left = a.averaged(), right = b.averaged();
+  for (std::size_t i = 0; i < left.size(); ++i) {
+    if (!torch::equal(left[i].second, right[i].second)) return false;
+  }
+  return left.size() == right.size();
+}
+
+TEST_F(TrainerTest, AResumedRunEndsWhereAnUninterruptedOneDoes) {
+  Trainer whole(recipe(), {simulator()}, nullptr, quick(), folder_ / "whole");
+  for (int i = 0; i < 6; ++i) whole.step();
+  TrainerOptions ahead = quick();
+  ahead.prefetch = true;
+  Trainer first(recipe(), {simulator()}, nullptr, ahead, folder_ / "parts");
+  for (int i = 0; i < 3; ++i) first.step();
+  EXPECT_FALSE(same_weights(first, whole));
+  first.save();
+  Trainer second(recipe(), {simulator()}, nullptr, quick(), folder_ / "parts");
+  second.resume();
+  EXPECT_EQ(second.progress().step, 3);
+  EXPECT_EQ(second.progress().scans, 6);
+  for (int i = 0; i < 3; ++i) second.step();
+  EXPECT_TRUE(same_weights(second, whole));
+}
+
+TEST_F(TrainerTest, BothNetworksLearnAFixedBatch) {
+  for (const double first_share : {1., 0.}) {
+    const auto live = recipe(first_share);
+    const auto scans = simulator()->simulate(0, 2);
+    torch::optim::AdamW optimizer(live->network().parameters(), torch::optim::AdamWOptions(3e-3));
+    double before = 0., after = 0.;
+    for (int i = 0; i <= 40; ++i) {
+      optimizer.zero_grad();
+      StepLoss loss = live->loss(scans, 3);  // the same step: the same perturbation
+      loss.total.backward();
+      optimizer.step();
+      after = loss.parts.at(first_share > 0. ? "first_points" : "shared_points");
+      if (i == 0) before = after;
+    }
+    EXPECT_LT(after, 0.6 * before) << "first_share " << first_share;
+  }
+}
+
+TEST_F(TrainerTest, TheBaselinesLearnAFixedBatch) {
+  torch::manual_seed(2);
+  BaselineOptions options;
+  options.width = 8;
+  options.dim = 16;
+  AnchorRecipe recipe(std::make_shared<PlaneInVol>(options));
+  const auto scans = simulator()->simulate(0, 2);
+  torch::optim::AdamW optimizer(recipe.network().parameters(), torch::optim::AdamWOptions(3e-3));
+  double before = 0., after = 0.;
+  for (int i = 0; i <= 20; ++i) {
+    optimizer.zero_grad();
+    StepLoss loss = recipe.loss(scans, 0);
+    loss.total.backward();
+    optimizer.step();
+    after = loss.parts.at("points");
+    if (i == 0) before = after;
+  }
+  EXPECT_LT(after, 0.6 * before);
+}
+
+TEST_F(TrainerTest, WarmStartsAreTheTruthIfNothingPerturbsThem) {
+  torch::manual_seed(7);
+  LiveRecipeOptions options;
+  options.first_share = options.unmoved_share = options.second_update_share = 0.;
+  options.perturb_deg = options.perturb_mm = options.global_deg = options.global_mm = 0.;
+  LiveRecipe still(std::make_shared<LiveNetwork>(small_network()), options, 1);
+  const auto scans = simulator()->simulate(0, 1);
+  EXPECT_LT(still.loss(scans, 0).parts.at("shared_start"), 1e-6);
+  options.perturb_mm = 6.;
+  LiveRecipe moving(std::make_shared<LiveNetwork>(small_network()), options, 1);
+  EXPECT_GT(moving.loss(scans, 0).parts.at("shared_start"), 1e-3);
+}
+
+// Reports a loss that is not finite at one step.
+class Treacherous : public TrainingRecipe {
+ public:
+  Treacherous(std::shared_ptr<TrainingRecipe> honest, std::uint64_t step) : honest_(std::move(honest)), step_(step) {}
+  PoseNetwork& network() override { return honest_->network(); }
+  std::vector<std::string> parts() const override { return honest_->parts(); }
+  StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override {
+    StepLoss loss = honest_->loss(scans, step);
+    if (step == step_) loss.total = loss.total * std::numeric_limits<double>::quiet_NaN();
+    return loss;
+  }
+
+ private:
+  std::shared_ptr<TrainingRecipe> honest_;
+  std::uint64_t step_;
+};
+
+TEST_F(TrainerTest, AStepThatIsNotFiniteIsSkippedAndCounted) {
+  Trainer trainer(std::make_shared<Treacherous>(recipe(), 1), {simulator()}, nullptr, quick(), folder_);
+  EXPECT_FALSE(trainer.step().empty());
+  const auto before = trainer.averaged();
+  EXPECT_TRUE(trainer.step().empty());
+  EXPECT_EQ(trainer.progress().skipped, 1);
+  const auto after = trainer.averaged();
+  for (std::size_t i = 0; i < before.size(); ++i) EXPECT_TRUE(torch::equal(before[i].second, after[i].second));
+  EXPECT_FALSE(trainer.step().empty());
+  EXPECT_EQ(trainer.progress().step, 3);
+}
+
+TEST_F(TrainerTest, TheLearningRateFollowsItsSchedule) {
+  TrainerOptions options = quick();
+  options.learning_rate = 1e-3;
+  options.warmup_steps = 10;
+  options.schedule = "linear";
+  options.decay_from_step = 100;
+  options.total_steps = 200;
+  const Trainer linear(recipe(), {simulator()}, nullptr, options, folder_);
+  EXPECT_NEAR(linear.learning_rate(0), 1e-4, 1e-9);
+  EXPECT_NEAR(linear.learning_rate(50), 1e-3, 1e-9);
+  EXPECT_NEAR(linear.learning_rate(150), 5e-4, 1e-9);
+  EXPECT_NEAR(linear.learning_rate(200), 0., 1e-9);
+  options.schedule = "cosine";
+  const Trainer cosine(recipe(), {simulator()}, nullptr, options, folder_);
+  EXPECT_NEAR(cosine.learning_rate(125), 1e-3 * 0.5 * (1. + std::cos(M_PI / 4.)), 1e-9);
+}
+
+TEST_F(TrainerTest, RunWritesLogsAndStateAndStopsWhenAsked) {
+  TrainerOptions options = quick();
+  options.validation_scans = 1;
+  int asked = 0;
+  Trainer::Hooks hooks;
+  hooks.stop = [&asked] { return ++asked > 3; };
+  {
+    Trainer trainer(recipe(), {simulator()}, simulator(9), options, folder_);
+    trainer.run(hooks, 0.);
+    EXPECT_EQ(trainer.progress().step, 3);
+  }
+  EXPECT_EQ(lines("training.csv").size(), 4U);  // a header and a row per step
+  // A row beyond the state, as a crash leaves it, goes when training continues.
+  std::ofstream(folder_ / "training.csv", std::ios::app) << "9,18,0,1,1,1,,,,,,,,\n";
+  options.total_steps = 5;
+  Trainer again(recipe(), {simulator()}, simulator(9), options, folder_);
+  again.resume();
+  again.run({}, 0.);
+  EXPECT_EQ(again.progress().step, 5);
+  const auto rows = lines("training.csv");
+  ASSERT_EQ(rows.size(), 6U);
+  EXPECT_EQ(rows.back().substr(0, 2), "5,");
+  EXPECT_EQ(lines("validation.csv").size(), 1U + 3U);  // a header and a row per iteration of the network
+}
+
+TEST_F(TrainerTest, ValidationMeasuresTheNetworksSteps) {
+  Trainer trainer(recipe(), {simulator()}, simulator(9), quick(), folder_);
+  const ValidationResult result = trainer.validate();
+  ASSERT_EQ(result.ed_mm.size(), 3U);
+  // The first iteration moves all slices of a scan together: relative to each other they stay as prescribed.
+  EXPECT_NEAR(result.relative_ed_mm[0], result.nominal_relative_ed_mm, 1e-3);
+  EXPECT_GT(result.ed_mm[0], result.relative_ed_mm[0]);
+  EXPECT_LE(result.gd_rad[0], M_PI);
+}
+
+TEST_F(TrainerTest, RejectsWhatDoesNotFit) {
+  EXPECT_THROW(Trainer(recipe(), {}, nullptr, quick(), folder_), std::invalid_argument);
+  TrainerOptions options = quick();
+  options.schedule = "quadratic";
+  EXPECT_THROW(Trainer(recipe(), {simulator()}, nullptr, options, folder_), std::invalid_argument);
+  Trainer trainer(recipe(), {simulator()}, nullptr, quick(), folder_);
+  EXPECT_THROW(trainer.resume(), std::runtime_error);  // nothing there
+  trainer.save();
+  options = quick();
+  options.seed = 2;
+  Trainer other(recipe(), {simulator()}, nullptr, options, folder_);
+  EXPECT_THROW(other.resume(), std::runtime_error);  // another seed
+  std::ofstream(folder_ / "state.pt") << "not a state";
+  EXPECT_THROW(trainer.resume(), std::runtime_error);
+  EXPECT_THROW(trainer.start_from({}), std::runtime_error);
+}
+
+}  // namespace
