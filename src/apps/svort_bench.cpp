@@ -1,4 +1,5 @@
-// Benchmarks of the core, one JSON object per line. `svort_bench forward` measures the acquisition operator.
+// Benchmarks of the core, one JSON object per line. `svort_bench forward` measures the acquisition operator,
+// `svort_bench network` the pose networks (network_bench.cpp).
 
 #include <ATen/Parallel.h>
 #include <sys/resource.h>
@@ -19,6 +20,7 @@
 #include <string>
 #include <vector>
 
+#include "network_bench.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
 #include "svort_ros/geometry/rigid_transform.h"
@@ -82,7 +84,7 @@ std::vector<std::int64_t> positive_integers(const std::string& name, const std::
 }
 
 Options parse(const std::vector<std::string>& arguments) {
-  if (arguments.empty() || arguments[0] != "forward") throw UsageError("the first argument must be forward");
+  if (arguments.empty() || arguments[0] != "forward") throw UsageError("the first argument must be forward or network");
   Options options;
   for (std::size_t i = 1; i < arguments.size(); i += 2) {
     const std::string& name = arguments[i];
@@ -457,13 +459,19 @@ void run(const Options& options) {
 int main(int argc, char** argv) {
   const std::vector<std::string> arguments(argv + 1, argv + argc);
   if (arguments.size() == 1 && (arguments[0] == "--help" || arguments[0] == "-h")) {
-    std::cout << kUsage;
+    std::cout << kUsage << svort::kNetworkBenchUsage;
     return 0;
   }
   try {
-    run(parse(arguments));
+    if (!arguments.empty() && arguments[0] == "network")
+      svort::run_network_bench({arguments.begin() + 1, arguments.end()});
+    else
+      run(parse(arguments));
   } catch (const UsageError& error) {
-    std::cerr << "svort_bench: " << error.what() << "\n" << kUsage;
+    std::cerr << "svort_bench: " << error.what() << "\n" << kUsage << svort::kNetworkBenchUsage;
+    return 2;
+  } catch (const std::invalid_argument& error) {
+    std::cerr << "svort_bench: " << error.what() << "\n";
     return 2;
   } catch (const std::exception& error) {
     std::cerr << "svort_bench: " << error.what() << "\n";

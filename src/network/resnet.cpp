@@ -93,6 +93,8 @@ ResNetImpl::ResNetImpl(const ResNetOptions& options) {
 }
 
 torch::Tensor ResNetImpl::stem(const torch::Tensor& images) {
+  // In this layout, not with the channels innermost: that would be 20 % faster on CPUs, but LibTorch 1.13 then computes
+  // the statistics of a batch too coarsely for parity (features off by 2e-4).
   return torch::max_pool2d(bn1_(conv1_(images)).relu_(), /*kernel_size=*/3, /*stride=*/2, /*padding=*/1);
 }
 

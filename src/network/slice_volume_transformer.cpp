@@ -3,6 +3,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "bfloat16_layers.h"
 #include "svort_ros/network/stage_clock.h"
 
 namespace svort {
@@ -53,17 +54,18 @@ torch::Tensor SliceVolumeTransformerImpl::image_channels(const torch::Tensor& sl
 SliceVolumeTransformerImpl::Output SliceVolumeTransformerImpl::forward(const torch::Tensor& slices,
                                                                        const torch::Tensor& simulated,
                                                                        const torch::Tensor& positions,
-                                                                       StageClock* clock) {
+                                                                       const NetworkRun& run) {
+  const BFloat16Layers layers(run.precision == torch::kBFloat16, slices.device().type());
   torch::Tensor features;
   {
-    const StageClock::Scope scope(clock, "encoder");
+    const StageClock::Scope scope(run.clock, "encoder");
     features = image_encoder(image_channels(slices, simulated));
   }
-  const StageClock::Scope scope(clock, "transformer");
+  const StageClock::Scope scope(run.clock, "transformer");
   Output output;
   const torch::Tensor x = encoder(features, positional_encoding(positions), &output.attention);
-  output.values = fc_(x);
-  if (options_.score) output.score = fc_score_(x);
+  output.values = fc_(x).to(slices.scalar_type());
+  if (options_.score) output.score = fc_score_(x).to(slices.scalar_type());
   return output;
 }
 

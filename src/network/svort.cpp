@@ -50,30 +50,44 @@ void check_input(const NetworkInput& input, const NetworkGrid& grid) {
   for (const std::int64_t size : grid.volume_shape) require(size >= 2, "volume_shape must be at least 2 x 2 x 2");
 }
 
-/// The forward model for slices at the given points. It computes on the CPU.
+/// Where the forward model computes: on the network's device if it can, else on the CPU.
+torch::Device model_device([[maybe_unused]] const NetworkInput& input) {
+#ifdef SVORT_WITH_CUDA
+  if (input.slices.is_cuda()) return input.slices.device();
+#endif
+  return torch::kCPU;
+}
+
+/// What the forward model takes. It carries no gradient.
+torch::Tensor for_model(const torch::Tensor& tensor, const NetworkInput& input) {
+  return tensor.detach().to(model_device(input)).contiguous();
+}
+
+/// The transforms of anchor points, on the CPU in float32, whatever the precision of the layers.
+torch::Tensor transforms_of(const torch::Tensor& points) {
+  return matrix_from_anchor_points(points.detach().to(torch::kCPU));
+}
+
 SliceAcquisition acquisition_at(const torch::Tensor& points, const NetworkInput& input, const NetworkGrid& grid,
                                 const NetworkRun& run) {
   const double ratio = input.slice_resolution_mm / grid.resolution_mm;
   AcquisitionGeometry geometry;
-  geometry.transforms =
-      change_resolution(matrix_from_anchor_points(points.detach().to(torch::kCPU)), 1., grid.resolution_mm);
+  geometry.transforms = for_model(change_resolution(transforms_of(points), 1., grid.resolution_mm), input);
   geometry.psf = gaussian_psf({ratio, ratio, input.thickness_mm / grid.resolution_mm});
   geometry.resolution_ratio = ratio;
   return {geometry, static_cast<int>(input.slices.size(2)), static_cast<int>(input.slices.size(3)), grid.volume_shape,
           run.formulation};
 }
 
-torch::Tensor on_cpu(const torch::Tensor& tensor) { return tensor.detach().to(torch::kCPU).contiguous(); }
-
 torch::Tensor simulate(const SliceAcquisition& acquisition, const torch::Tensor& volume, const NetworkInput& input,
                        const NetworkRun& run) {
   const StageClock::Scope scope(run.clock, "forward_model");
-  return acquisition.forward(on_cpu(volume)).to(input.slices.device());
+  return acquisition.forward(for_model(volume, input)).to(input.slices.device());
 }
 
 torch::Tensor reconstruct(const SliceAcquisition& acquisition, const NetworkInput& input, const NetworkRun& run) {
   const StageClock::Scope scope(run.clock, "adjoint");
-  return reconstruct_psf(on_cpu(input.slices), acquisition).to(input.slices.device());
+  return reconstruct_psf(for_model(input.slices, input), acquisition).to(input.slices.device());
 }
 
 torch::Tensor solve(const SliceAcquisition& acquisition, const torch::Tensor& start, const torch::Tensor& weights,
@@ -81,7 +95,8 @@ torch::Tensor solve(const SliceAcquisition& acquisition, const torch::Tensor& st
   const StageClock::Scope scope(run.clock, "conjugate_gradients");
   ConjugateGradientOptions options;
   options.iterations = kConjugateGradients;
-  return solve_weighted_inverse(on_cpu(input.slices), acquisition, on_cpu(weights), on_cpu(start), options)
+  return solve_weighted_inverse(for_model(input.slices, input), acquisition, for_model(weights, input),
+                                for_model(start, input), options)
       .to(input.slices.device());
 }
 
@@ -160,7 +175,7 @@ Svort::PoseUpdate Svort::update_poses(std::int64_t iteration, const torch::Tenso
   // The points that the embedding is made of carry no gradient from the iteration before.
   const torch::Tensor before = points.detach();
   const auto output =
-      pose_network(iteration)->forward(input.slices, simulated, torch::cat({before, input.positions}, 1), run.clock);
+      pose_network(iteration)->forward(input.slices, simulated, torch::cat({before, input.positions}, 1), run);
   PoseUpdate update;
   update.points = before + output.values;
   if (output.score.defined()) update.weights = weights_from_score(output.score);
@@ -193,9 +208,9 @@ Svort::VolumeUpdate SvortV1::estimate_volume(const torch::Tensor& points, const 
   VolumeUpdate update;
   update.reconstructed = reconstruct(acquisition, input, run);
   const torch::Tensor simulated = simulate(acquisition, update.reconstructed, input, run);
-  const torch::Tensor axisangle = matrix_to_axisangle(matrix_from_anchor_points(points.detach()));
+  const torch::Tensor axisangle = matrix_to_axisangle(transforms_of(points)).to(input.slices.device());
   update.weights = weights_from_score(
-      quality_network(input.slices, simulated, torch::cat({axisangle, input.positions}, 1), run.clock).values);
+      quality_network(input.slices, simulated, torch::cat({axisangle, input.positions}, 1), run).values);
   update.volume = solve(acquisition, update.reconstructed, update.weights, input, run);
   return update;
 }

@@ -36,6 +36,8 @@ struct NetworkGrid {
 struct NetworkRun {
   int iterations = 0;  ///< K; 0: as many as the network was made for
   AcquisitionFormulation formulation = AcquisitionFormulation::exact;
+  /// bfloat16: coarser and, on hardware that has it, faster layers, for networks that offer it; geometry stays float32.
+  torch::ScalarType precision = torch::kFloat32;
   StageClock* clock = nullptr;  ///< takes the time of each stage, if not null
 };
 

@@ -5,12 +5,11 @@
 #include <cstdint>
 
 #include "svort_ros/network/attention.h"
+#include "svort_ros/network/pose_network.h"
 #include "svort_ros/network/positional_encoding.h"
 #include "svort_ros/network/resnet.h"
 
 namespace svort {
-
-class StageClock;
 
 /// Shape of a slice-volume Transformer (SVT; paper, sec. 2.2).
 struct SliceVolumeTransformerOptions {
@@ -42,9 +41,9 @@ class SliceVolumeTransformerImpl : public torch::nn::Module {
   /// @param slices     n x 1 x h x w
   /// @param simulated  likewise; undefined if the options have none
   /// @param positions  n x positions
-  /// @param clock      if not null, takes the time of the stages "encoder" and "transformer"
+  /// @param run        its clock takes the time of the stages "encoder" and "transformer"; its precision is the layers'
   Output forward(const torch::Tensor& slices, const torch::Tensor& simulated, const torch::Tensor& positions,
-                 StageClock* clock = nullptr);
+                 const NetworkRun& run = {});
 
   ImageEncoder image_encoder{nullptr};
   PositionalEncoding positional_encoding{nullptr};
