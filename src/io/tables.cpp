@@ -10,16 +10,19 @@
 #include <sstream>
 #include <stdexcept>
 #include <string_view>
+#include <utility>
 
 #include "svort_ros/io/atomic_file.h"
 
 namespace svort {
 namespace {
 
-constexpr std::array<const char*, 21> kPoseColumns = {
-    "scan_id", "stack",   "slice",   "stamp",   "tx",      "ty",      "tz",      "qx",     "qy",  "qz",    "qw",
-    "head_tx", "head_ty", "head_tz", "head_qx", "head_qy", "head_qz", "head_qw", "weight", "ncc", "status"};
-constexpr std::size_t kRequiredPoseColumns = 11;  // truth.csv ends here
+constexpr std::array<const char*, 24> kPoseColumns = {
+    "scan_id", "stack",   "slice",  "stamp",   "tx",      "ty",        "tz",      "qx",
+    "qy",      "qz",      "qw",     "head_tx", "head_ty", "head_tz",   "head_qx", "head_qy",
+    "head_qz", "head_qw", "weight", "ncc",     "status",  "displaced", "void",    "noisy"};
+constexpr std::size_t kRequiredPoseColumns = 11;  // up to qw
+constexpr std::size_t kEstimateColumns = 21;      // the others are flags of truth.csv
 
 constexpr const char* kUpdateHeader =
     "stamp,stack,slice,sequence_length,revision,latency_ms,encoded,device,tx,ty,tz,qx,qy,qz,qw,status,reason,"
@@ -149,6 +152,13 @@ class RowReader {
     return result;
   }
 
+  bool flag(const std::string& column) const {
+    const std::string& field = text(column);
+    if (field != "0" && field != "1")
+      fail(path_, record_.line, "column '" + column + "': '" + field + "' is not 0 or 1");
+    return field == "1";
+  }
+
   /// "12.000000001" as ns, without the rounding of a double.
   std::int64_t nanoseconds(const std::string& column) const {
     const std::string& field = text(column);
@@ -221,13 +231,24 @@ std::map<std::string, std::size_t> read_header(const std::filesystem::path& path
 
 void write_pose_table(const std::filesystem::path& path, const Estimate& estimate) {
   std::ostringstream csv;
-  for (std::size_t i = 0; i < kPoseColumns.size(); ++i) csv << (i ? "," : "") << kPoseColumns[i];
+  for (std::size_t i = 0; i < kEstimateColumns; ++i) csv << (i ? "," : "") << kPoseColumns[i];
   csv << '\n';
   for (const SliceEstimate& slice : estimate.slices)
     csv << field(slice.info.scan_id) << ',' << slice.info.stack << ',' << slice.info.index << ','
         << seconds(slice.info.stamp_ns) << ',' << pose_fields(slice.T_brain_slice) << ','
         << pose_fields(slice.T_scanner_brain) << ',' << number(slice.weight) << ',' << number(slice.ncc) << ','
         << to_string(slice.status) << '\n';
+  write_file(path, csv.str());
+}
+
+void write_truth_table(const std::filesystem::path& path, const std::vector<PoseRow>& rows) {
+  std::ostringstream csv;
+  for (std::size_t i = 0; i < kPoseColumns.size(); ++i)
+    if (i < kRequiredPoseColumns || i >= kEstimateColumns) csv << (i ? "," : "") << kPoseColumns[i];
+  csv << '\n';
+  for (const PoseRow& row : rows)
+    csv << field(row.scan_id) << ',' << row.stack << ',' << row.slice << ',' << seconds(row.stamp_ns) << ','
+        << pose_fields(row.T_brain_slice) << ',' << row.displaced << ',' << row.voided << ',' << row.noisy << '\n';
   write_file(path, csv.str());
 }
 
@@ -258,6 +279,8 @@ std::vector<PoseRow> read_pose_table(const std::filesystem::path& path) {
     if (reader.has("weight")) row.weight = reader.value<double>("weight");
     if (reader.has("ncc")) row.ncc = reader.value<double>("ncc");
     if (reader.has("status")) row.status = reader.text("status");
+    for (auto [column, flag] : {std::pair{"displaced", &row.displaced}, {"void", &row.voided}, {"noisy", &row.noisy}})
+      if (reader.has(column)) *flag = reader.flag(column);
     rows.push_back(row);
   }
   return rows;

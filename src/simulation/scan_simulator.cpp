@@ -308,7 +308,7 @@ std::vector<SimulatedScan> ScanSimulator::simulate(std::uint64_t first, int coun
   std::vector<std::int64_t> kept, shift_x, shift_y;
   std::vector<float> truth, nominal, positions, times, bias, voids, per_slice;
   std::vector<std::int64_t> counts, scan_of_row;
-  std::vector<std::uint8_t> flags;
+  std::vector<std::uint8_t> flags, black, maskless;
   std::vector<std::int64_t> begins;
   std::vector<SimulatedScan> scans(drafts.size());
   for (std::size_t i = 0; i < drafts.size(); ++i) {
@@ -396,6 +396,11 @@ std::vector<SimulatedScan> ScanSimulator::simulate(std::uint64_t first, int coun
       for (const double c :
            {artifacts.noise, artifacts.gain * (1. - artifacts.whole_loss), artifacts.local_loss, draft.artifacts.gamma})
         per_slice.push_back(static_cast<float>(c));
+      if (!options_.prepared) {
+        scan.dropped.push_back(artifacts.dropped);
+        black.push_back(artifacts.dropped ? 1 : 0);
+        maskless.push_back(artifacts.dropped || artifacts.mask_lost ? 1 : 0);
+      }
     }
     draft.plan.acquired = std::move(remaining);
     scan.number = draft.number;
@@ -439,7 +444,15 @@ std::vector<SimulatedScan> ScanSimulator::simulate(std::uint64_t first, int coun
     const torch::Tensor real = images + noise * channels[0], imaginary = noise * channels[1];
     images = torch::sqrt(real * real + imaginary * imaginary);
   }
-  if (options_.prepared) images = images * masks;
+  if (options_.prepared) {
+    images = images * masks;
+  } else {
+    const auto rows_of = [&](const std::vector<std::uint8_t>& values) {
+      return torch::tensor(values, torch::kUInt8).to(device_).view({n, 1, 1, 1}).to(torch::kBool);
+    };
+    images = images.masked_fill(rows_of(black), 0.);
+    masks = masks & ~rows_of(maskless);
+  }
 
   // 6. Scan by scan: intensity scale, tensors.
   const torch::Tensor all_truth = floats(truth, {n, 3, 4}), all_nominal = floats(nominal, {n, 3, 4});

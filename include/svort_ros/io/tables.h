@@ -22,11 +22,18 @@ struct PoseRow {
   double weight = 1.;
   double ncc = 0.;
   std::string status;
+  bool displaced = false;  ///< truth.csv: the head moved since the slice's stack was planned
+  bool voided = false;     ///< truth.csv, column void: signal void
+  bool noisy = false;      ///< truth.csv: much more noise than the other slices
 };
 
 /// Writes poses.csv. All writers here write a temporary file and rename it, so a file is whole or not there.
 /// @throws std::runtime_error naming the file and the reason
 void write_pose_table(const std::filesystem::path& path, const Estimate& estimate);
+
+/// Writes truth.csv: scan_id to qw as in poses.csv, then the flags displaced, void, noisy (0 or 1).
+/// @throws std::runtime_error naming the file and the reason
+void write_truth_table(const std::filesystem::path& path, const std::vector<PoseRow>& rows);
 
 /// Reads poses.csv or truth.csv. Columns are found by their names; scan_id to qw must be there.
 /// @throws std::runtime_error naming the file, the line and the column: missing, unknown or repeated column, wrong
