@@ -62,7 +62,7 @@ struct SimulatedScan {
   torch::Tensor displaced;      ///< n, bool: the head moved since the stack was planned, see ScannerOptions
   torch::Tensor voided;         ///< n, bool: signal void
   torch::Tensor noisy;          ///< n, bool: much more noise than the others
-  std::vector<bool> dropped;  ///< whole slices only, n: never arrives, black here. Prepared ones are left out
+  std::vector<bool> dropped;    ///< whole slices only, n: never arrives, black here. Prepared ones are left out
   ScanPlan plan;                ///< `acquired` holds the n slices; poses are those of the cropped slices
   double intensity_scale = 1.;  ///< slices and volume were divided by this (protocol of the live sequence)
 };
