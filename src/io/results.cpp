@@ -89,6 +89,13 @@ std::string run_json(const LivePipeline& pipeline, const RunInfo& run) {
   json["threads"] = run.threads;
   json["device"] = pipeline.device();
   json["estimator"] = {{"method", pipeline.options().estimator.method}, {"weights", nullptr}};
+  const EstimatorNotes notes = pipeline.notes();
+  if (!notes.network.empty()) {
+    json["estimator"]["network"] = notes.network;
+    json["estimator"]["weights"] = {{"file", pipeline.options().estimator.network.weights},
+                                    {"sha256", notes.weights_sha256}};
+  }
+  if (!notes.warnings.empty()) json["estimator"]["warnings"] = notes.warnings;
   if (pipeline.options().estimator.method == "nominal")
     json["estimator"]["note"] = "poses are the scanner's prescription; no motion was estimated and no network was used";
   json["slices"] = sequence.slices().size();

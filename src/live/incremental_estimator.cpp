@@ -2,6 +2,7 @@
 
 #include <stdexcept>
 
+#include "svort_ros/live/network_estimator.h"
 #include "svort_ros/live/nominal_estimator.h"
 
 namespace svort {
@@ -10,13 +11,16 @@ const char* to_string(PoseStatus status) {
   switch (status) {
     case PoseStatus::nominal:
       return "nominal";
+    case PoseStatus::network:
+      return "network";
   }
   throw std::logic_error("unknown PoseStatus");
 }
 
 std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options) {
   if (options.method == "nominal") return std::make_unique<NominalEstimator>(options);
-  throw std::invalid_argument("estimator.method is '" + options.method + "'; known: nominal");
+  if (options.method == "network") return std::make_unique<NetworkEstimator>(options);
+  throw std::invalid_argument("estimator.method is '" + options.method + "'; known: nominal, network");
 }
 
 }  // namespace svort

@@ -31,10 +31,7 @@ void NominalEstimator::add(const SliceSequence& sequence) {
     T_scanner_brain_.setIdentity();
     T_scanner_brain_.translation() = centre;
     if (!first) ++estimate_.frame_revision;
-    for (SliceEstimate& each : estimate_.slices) {
-      each.T_scanner_brain = T_scanner_brain_;
-      each.T_brain_slice = T_scanner_brain_.inverse() * each.info.T_scanner_slice;
-    }
+    make_nominal();
   } else {
     SliceEstimate& added = estimate_.slices[static_cast<std::size_t>(position)];
     added.T_scanner_brain = T_scanner_brain_;
@@ -43,6 +40,16 @@ void NominalEstimator::add(const SliceSequence& sequence) {
   estimate_.scan_id = sequence.scan_id();
   estimate_.final = false;
   ++estimate_.revision;
+}
+
+void NominalEstimator::make_nominal() {
+  for (SliceEstimate& each : estimate_.slices) {
+    each.T_scanner_brain = T_scanner_brain_;
+    each.T_brain_slice = T_scanner_brain_.inverse() * each.info.T_scanner_slice;
+    each.weight = 1.;
+    each.status = PoseStatus::nominal;
+  }
+  estimate_.encoded = 0;
 }
 
 void NominalEstimator::update_volume(const SliceSequence& sequence) {

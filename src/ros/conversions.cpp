@@ -258,6 +258,9 @@ SequenceEstimate to_msg(const svort::Estimate& estimate, const std::string& scan
       case svort::PoseStatus::nominal:
         pose.status = SlicePose::NOMINAL;
         break;
+      case svort::PoseStatus::network:
+        pose.status = SlicePose::NETWORK;
+        break;
     }
     message.slices.push_back(pose);
   }

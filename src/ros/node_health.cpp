@@ -123,6 +123,8 @@ void NodeHealth::report_estimator(diagnostic_updater::DiagnosticStatusWrapper& s
     status.summaryf(DiagnosticStatus::ERROR, "%zu internal errors, the last: %s", failures_, last_failure_.c_str());
   else if (estimator_.method == "nominal")
     status.summary(DiagnosticStatus::WARN, "poses are nominal: the scanner's own, no head motion is estimated");
+  else if (!estimator_.warnings.empty())
+    status.summary(DiagnosticStatus::WARN, estimator_.warnings.back());
   else
     status.summary(DiagnosticStatus::OK, "head motion is estimated");
   status.add("method", estimator_.method);

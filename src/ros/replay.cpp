@@ -140,6 +140,7 @@ ReplaySummary replay(const ReplayOptions& options) {
   }
   pipeline.finalise();
   write(pipeline);
+  summary.warnings = pipeline.notes().warnings;
   summary.wall_s = milliseconds_since(start) / 1000.;
   const auto [first, last] = std::minmax_element(
       messages.begin(), messages.end(), [](const Slice& a, const Slice& b) { return a.header.stamp < b.header.stamp; });
@@ -190,7 +191,6 @@ int run_svort_replay(int argc, char** argv) {
     return kBadInput;
   }
   std::string config;
-  std::string device = "cpu";
   app.add_option("--bag", options.bag, "bag with slices; or use --stacks");
   app.add_option("--topic", options.topic, "topic of the slices in the bag")->capture_default_str();
   add_stack_options(app, options.input);
@@ -198,27 +198,32 @@ int run_svort_replay(int argc, char** argv) {
   app.add_option("--config", config, "YAML file with options, like config/node/default.yaml");
   app.add_option("--threads", options.server.node.threads, "threads of the estimator; 0 takes all cores")
       ->capture_default_str();
-  app.add_option("--device", device, "where the estimator runs")
-      ->check(CLI::IsMember({"cpu", "cuda"}))
+  svort::NetworkEstimatorOptions& network = options.server.pipeline.estimator.network;
+  CLI::Option* weights = app.add_option("--weights", network.weights, "run the network of this file (method network)");
+  CLI::Option* name =
+      app.add_option("--network", network.name, "run this network (method network): v1, v2, ..; the file must hold it");
+  app.add_option("--device", network.device, "where the network runs: auto, cpu or cuda; all else is on the CPU")
+      ->check(CLI::IsMember({"auto", "cpu", "cuda"}))
       ->capture_default_str();
   app.add_option("--realtime", options.realtime, "1: the scanner's pace, 2: twice as fast, 0: as fast as possible")
       ->capture_default_str();
-  app.add_option("--seed", options.seed, "seed of random numbers; the nominal estimator draws none")
-      ->capture_default_str();
+  app.add_option("--seed", options.seed, "seed of random numbers; the estimators draw none")->capture_default_str();
   svort::bind_options(app, options.server.pipeline);
   return run_program(app, argc, argv, [&] {
     if (options.bag.empty() == options.input.stacks.empty())
       throw std::invalid_argument("give either --bag or --stacks");
     if (!options.bag.empty() && !options.input.masks.empty())
       throw std::invalid_argument("--masks goes with --stacks; a bag holds its masks itself");
-    if (device == "cuda")
-      throw std::invalid_argument("--device cuda: estimator '" + options.server.pipeline.estimator.method +
-                                  "' runs on the CPU only");
+    if (weights->count() + name->count() > 0) options.server.pipeline.estimator.method = "network";
+    const svort::EstimatorOptions& estimator = options.server.pipeline.estimator;
+    if (estimator.method == "nominal" && estimator.network.device == "cuda")
+      throw std::invalid_argument("--device cuda: estimator 'nominal' runs on the CPU only");
     const ReplaySummary summary = replay(options);
     std::printf("%zu slices: %zu kept, %zu rejected; %.1f s", summary.arrivals, summary.kept,
                 summary.arrivals - summary.kept, summary.wall_s);
     if (summary.scan_s > 0.) std::printf(" (%.1f times the scanner's pace)", summary.scan_s / summary.wall_s);
     std::printf("; poses are %s\n", options.server.pipeline.estimator.method.c_str());
+    for (const std::string& warning : summary.warnings) std::fprintf(stderr, "WARNING: %s\n", warning.c_str());
     for (const auto& folder : summary.folders) std::printf("results: %s\n", folder.c_str());
     if (summary.kept > 0) return 0;
     std::fprintf(stderr, "%s: no slice was kept; updates.csv has the reasons\n", app.get_name().c_str());

@@ -115,6 +115,7 @@ class SvortServer::Worker {
   svort::Arrival take_in(const SliceFromMessage& decoded);
   void end_scan();
   void update_volume();
+  void report_estimator();
   void publish_volume();
   void publish_estimate();
   void save_at_exit();
@@ -152,6 +153,7 @@ class SvortServer::Worker {
   Clock::time_point scan_started_;
   bool estimate_is_new_ = false;
   bool has_unsaved_ = false;
+  std::size_t warned_ = 0;  ///< warnings of the estimator that are in the log
 
   ros::Publisher status_publisher_;
   EstimatePublisher publisher_;
@@ -159,9 +161,16 @@ class SvortServer::Worker {
   std::thread thread_;  ///< last: it uses all of the above
 };
 
+void SvortServer::Worker::report_estimator() {
+  const svort::EstimatorNotes notes = pipeline_->notes();
+  health_.set_estimator(
+      {options_.pipeline.estimator.method, pipeline_->device(), svort::thread_count(), notes.warnings});
+  for (; warned_ < notes.warnings.size(); ++warned_) ROS_WARN("%s", notes.warnings[warned_].c_str());
+}
+
 void SvortServer::Worker::run() {
   svort::set_thread_count(options_.node.threads);
-  health_.set_estimator({options_.pipeline.estimator.method, pipeline_->device(), svort::thread_count()});
+  report_estimator();
   for (;;) {
     const bool volume_is_due = awaiting_volume_.size() > 0;
     Inbox<Item>::Batch batch = inbox_.take_all(!volume_is_due);
@@ -172,6 +181,7 @@ void SvortServer::Worker::run() {
         item.command(batch.closed);
     }
     if (estimate_is_new_) publish_estimate();
+    report_estimator();
     if (batch.closed) break;
     // A volume takes longer than a slice: it waits for a pause, but in a steady stream not forever.
     const auto limit = static_cast<std::size_t>(options_.node.volume_every);

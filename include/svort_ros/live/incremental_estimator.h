@@ -14,6 +14,7 @@ namespace svort {
 /// Where a slice's pose comes from.
 enum class PoseStatus {
   nominal,  ///< the scanner's own prescription; the head is assumed not to have moved
+  network,  ///< a network's answer
 };
 const char* to_string(PoseStatus status);
 
@@ -39,6 +40,29 @@ struct Estimate {
   bool final = false;                 ///< set by finalise(), until the next slice
 };
 
+/// For the method "network".
+struct NetworkEstimatorOptions {
+  std::string weights;                ///< file of weights, see svort_checkpoint; its network is the one that runs
+  std::string name;                   ///< if not empty, the network that the file must hold
+  std::string when = "scan_end";      ///< "every_arrival" runs it causally, over the slices so far, if there is time
+  std::string device = "auto";        ///< "cpu", "cuda", or whichever there is
+  std::string precision = "float32";  ///< "tf32" and "bfloat16" are faster on new GPUs, and coarser
+  int iterations = 0;                 ///< transformation updates; 0: as many as the network was made for
+  /// Of the volume that the network sees. Versions 1 and 2 of SVoRT were trained at 0.8 mm.
+  double volume_resolution_mm = 0.8;
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v("weights", weights, "file of weights; its network is the one that runs");
+    v("name", name, "if not empty, the network that the file must hold: v1, v2, ..");
+    v("when", when, "scan_end, or every_arrival: causally, over the slices so far");
+    v("device", device, "auto (a GPU if there is one), cpu or cuda");
+    v("precision", precision, "float32, tf32 (GPU only) or bfloat16: faster and coarser in this order");
+    v("iterations", iterations, "transformation updates; 0: as many as the network was made for");
+    v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume that the network sees, mm");
+  }
+};
+
 struct EstimatorOptions {
   std::string method = "nominal";     ///< which implementation; see make_estimator
   std::string formulation = "fast";   ///< of the forward model; "exact" to match the public implementation to rounding
@@ -48,17 +72,26 @@ struct EstimatorOptions {
   int cg_iterations = 0;              ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
   /// The same, in finalise(). More sharpen the volume where poses are right, and fit noise and motion where not.
   int final_cg_iterations = 2;
+  NetworkEstimatorOptions network;
 
   template <class Visitor>
   void visit(Visitor&& v) {
-    v("method", method, "estimator: nominal (the scanner's own poses, no motion estimate)");
+    v("method", method, "estimator: nominal (the scanner's own poses, no motion estimate) or network");
     v("formulation", formulation, "forward model: fast, or exact (every tap of the slice profile, ten times slower)");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume, mm");
     v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
     v("recentre_mm", recentre_mm, "the brain frame moves only when the brain's centre is off by more than this, mm");
     v("cg_iterations", cg_iterations, "conjugate-gradient steps per volume while slices arrive; 0: PSF reconstruction");
     v("final_cg_iterations", final_cg_iterations, "conjugate-gradient steps of the final volume");
+    v.section("network", network);
   }
+};
+
+/// What a user must know about an estimator, beside its options.
+struct EstimatorNotes {
+  std::string network;                ///< empty: none
+  std::string weights_sha256;         ///< of its parameters; empty: none
+  std::vector<std::string> warnings;  ///< what makes its poses doubtful, or slow; may grow while it runs
 };
 
 /// Turns a growing sequence of slices into poses and a volume. One thread calls it; it keeps no reference to the
@@ -85,9 +118,11 @@ class IncrementalEstimator {
   virtual const Volume& volume() const = 0;
   /// "cpu" or "cuda:0".
   virtual std::string device() const = 0;
+  virtual EstimatorNotes notes() const { return {}; }
 };
 
 /// @throws std::invalid_argument naming the option if a value is out of range or the method is unknown
+/// @throws std::runtime_error naming the file of weights and what is wrong with it
 std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options);
 
 }  // namespace svort

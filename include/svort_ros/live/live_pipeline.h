@@ -53,6 +53,7 @@ class LivePipeline {
   /// Estimate of the slice kept by the last add() that kept one; null before.
   const SliceEstimate* newest() const;
   std::string device() const { return estimator_->device(); }
+  EstimatorNotes notes() const { return estimator_->notes(); }
   const PipelineOptions& options() const { return options_; }
   Journal& journal() { return journal_; }
   const Journal& journal() const { return journal_; }

@@ -24,12 +24,17 @@ class NominalEstimator : public IncrementalEstimator {
   const Volume& volume() const override { return volume_; }
   std::string device() const override { return "cpu"; }
 
+ protected:
+  /// Puts every slice where the scanner said it was, in this estimator's brain frame.
+  void make_nominal();
+
+  Estimate estimate_;
+
  private:
   EstimatorOptions options_;
   AcquisitionFormulation formulation_;
   ImageGrid grid_;
   Pose T_scanner_brain_ = Pose::Identity();
-  Estimate estimate_;
   Volume volume_;
 };
 

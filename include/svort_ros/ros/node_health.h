@@ -25,6 +25,7 @@ class NodeHealth {
     std::string method;
     std::string device;
     int threads = 0;
+    std::vector<std::string> warnings;  ///< see svort::EstimatorNotes
   };
 
   /// @param inbox_length asked for at every report

@@ -17,7 +17,7 @@ struct ReplayOptions {
   std::string output;      ///< folder of the results
   ServerOptions server;    ///< of `node` only `threads` matters here
   double realtime = 0.;    ///< 1 is the scanner's pace, 2 twice as fast; 0 is as fast as possible
-  std::uint64_t seed = 0;  ///< written into run.json; the nominal estimator draws no random numbers
+  std::uint64_t seed = 0;  ///< written into run.json; the estimators draw no random numbers
 };
 
 /// What came out of it.
@@ -27,6 +27,7 @@ struct ReplaySummary {
   double wall_s = 0.;
   double scan_s = 0.;  ///< time between first and last acquisition
   std::vector<std::filesystem::path> folders;
+  std::vector<std::string> warnings;  ///< about the estimator, e.g. that its weights are untrained
 };
 
 /// Feeds the slices to the live pipeline one by one, with a new volume after each, and writes the results: into
