@@ -4,7 +4,10 @@
 
 #include <cstdlib>
 #include <filesystem>
+#include <map>
 #include <memory>
+#include <string>
+#include <vector>
 
 #include "network/small_networks.h"
 #include "svort_ros/geometry/rigid_transform.h"
