@@ -38,7 +38,7 @@ add_dependencies(svort_ros_layer ${PROJECT_NAME}_generate_messages_cpp)
 list(APPEND SVORT_LIBRARIES svort_io svort_ros_layer)
 
 # Programs and the nodelet's library, where rosrun, roslaunch and pluginlib look for them.
-foreach(program svort_node stack_player_node svort_replay nifti_to_bag svort_evaluate)
+foreach(program svort_node stack_player_node svort_replay nifti_to_bag svort_simulate svort_evaluate)
   add_executable(${program} src/apps/${program}.cpp)
   if(program STREQUAL "svort_evaluate")
     target_link_libraries(${program} PRIVATE svort_io)
