@@ -19,22 +19,25 @@ namespace nn = torch::nn;
 constexpr int kNormGroups = 8;
 constexpr int kStages = 3;
 constexpr int kCoordinates = 2;
+constexpr int kStemKernel = 6;
 
 void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument("LiveNetwork: " + message);
 }
 
-nn::Conv2d convolution(std::int64_t in, std::int64_t out, int kernel, int stride, int padding) {
-  return nn::Conv2d(nn::Conv2dOptions(in, out, kernel).stride(stride).padding(padding).bias(false));
+// The padding is convolve()'s.
+nn::Conv2d convolution(std::int64_t in, std::int64_t out, int kernel, int stride) {
+  return nn::Conv2d(nn::Conv2dOptions(in, out, kernel).stride(stride).bias(false));
 }
 
 nn::GroupNorm group_norm(std::int64_t channels) { return nn::GroupNorm(nn::GroupNormOptions(kNormGroups, channels)); }
 
 // The modules keep float32 parameters; in bfloat16 they are rounded on the fly, so gradients reach the float32 ones.
 torch::Tensor convolve(const nn::Conv2d& module, const torch::Tensor& x) {
-  const auto& options = module->options;
-  return torch::conv2d(x, module->weight.to(x.scalar_type()), {}, options.stride(),
-                       c10::get<torch::ExpandingArray<2>>(options.padding()));
+  // So that the output has size / stride pixels: half a kernel, less for the stem, whose stride is almost its kernel.
+  const std::int64_t kernel = module->options.kernel_size()->at(0);
+  const std::int64_t padding = kernel == kStemKernel ? 1 : kernel / 2;
+  return torch::conv2d(x, module->weight.to(x.scalar_type()), {}, module->options.stride(), padding);
 }
 
 torch::Tensor normalise(const nn::GroupNorm& module, const torch::Tensor& x) {
@@ -70,7 +73,7 @@ constexpr int kPositionLength = 2 * (9 * kPointWaves.octaves + kIndexWaves.octav
 
 LiveEncoderImpl::LiveEncoderImpl(const LiveNetworkOptions& options, int channels) {
   // A stem that leaves a quarter of the pixels along each side: 8 mm cells, the size of what tells slices apart.
-  stem_ = register_module("stem", convolution(channels, options.width, 6, 4, 1));
+  stem_ = register_module("stem", convolution(channels, options.width, kStemKernel, 4));
   stem_norm_ = register_module("stem_norm", group_norm(options.width));
   std::int64_t in = options.width;
   for (int stage = 0; stage < kStages; ++stage) {
@@ -79,13 +82,13 @@ LiveEncoderImpl::LiveEncoderImpl(const LiveNetworkOptions& options, int channels
       const int stride = stage > 0 && index == 0 ? 2 : 1;
       const std::string name = "stage" + std::to_string(stage) + "_block" + std::to_string(index) + "_";
       Block block;
-      block.first = register_module(name + "first", convolution(in, out, 3, stride, 1));
+      block.first = register_module(name + "first", convolution(in, out, 3, stride));
       block.first_norm = register_module(name + "first_norm", group_norm(out));
-      block.second = register_module(name + "second", convolution(out, out, 3, 1, 1));
+      block.second = register_module(name + "second", convolution(out, out, 3, 1));
       block.second_norm = register_module(name + "second_norm", group_norm(out));
       nn::init::zeros_(block.second_norm->weight);  // every block starts as the identity
       if (stride != 1 || in != out)
-        block.shortcut = register_module(name + "shortcut", convolution(in, out, 1, stride, 0));
+        block.shortcut = register_module(name + "shortcut", convolution(in, out, 1, stride));
       blocks_.push_back(block);
       in = out;
     }

@@ -11,7 +11,7 @@
 #include <stdexcept>
 
 #include "svort_ros/geometry/anchor_points.h"
-#include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/metrics/pose_error.h"
 
 namespace svort {
 namespace {
@@ -55,38 +55,6 @@ class Log {
  private:
   std::filesystem::path path_;
 };
-
-struct PoseError {
-  double ed_mm = 0., gd_rad = 0.;
-};
-
-// Errors of places (n x 3 x 4) against the truth: as they are, or after the one rigid motion that brings them nearest.
-PoseError pose_error(const torch::Tensor& places, const torch::Tensor& truth, const AnchorFrame& frame, bool relative) {
-  const auto points = [&frame](const torch::Tensor& transforms) {
-    return anchor_points_from_matrix(transforms.to(torch::kCPU, torch::kFloat64), frame).view({-1, 3, 3});
-  };
-  const torch::Tensor target = points(truth);
-  torch::Tensor here = points(places);
-  torch::Tensor rotation = torch::matmul(truth.slice(2, 0, 3).to(torch::kFloat64).transpose(1, 2),
-                                         places.slice(2, 0, 3).to(torch::kFloat64));
-  if (relative) {
-    const std::vector<std::int64_t> all = {0, 1};
-    const torch::Tensor centre_here = here.mean(all), centre_target = target.mean(all);
-    const torch::Tensor a = (here - centre_here).reshape({-1, 3}), b = (target - centre_target).reshape({-1, 3});
-    const auto svd = torch::linalg_svd(torch::matmul(b.t(), a), false);
-    torch::Tensor signs = torch::ones({3}, torch::kFloat64);
-    signs[2] = torch::linalg_det(torch::matmul(std::get<0>(svd), std::get<2>(svd)));
-    const torch::Tensor motion = torch::matmul(std::get<0>(svd) * signs, std::get<2>(svd));
-    here = torch::matmul(here - centre_here, motion.t()) + centre_target;
-    rotation = torch::matmul(truth.slice(2, 0, 3).to(torch::kFloat64).transpose(1, 2),
-                             torch::matmul(motion, places.slice(2, 0, 3).to(torch::kFloat64)));
-  }
-  PoseError error;
-  error.ed_mm = (here - target).norm(2, 2).mean().item<double>();
-  const torch::Tensor trace = rotation.diagonal(0, 1, 2).sum(1);
-  error.gd_rad = ((trace - 1.) / 2.).clamp(-1., 1.).acos().mean().item<double>();
-  return error;
-}
 
 std::string duration(double seconds) {
   std::ostringstream text;
@@ -293,16 +261,16 @@ ValidationResult Trainer::validate() {
     scans += 1.;
     const AnchorFrame frame = {static_cast<int>(scan.input.slices.size(3)), static_cast<int>(scan.input.slices.size(2)),
                                scan.input.slice_resolution_mm};
-    const PoseError nominal = pose_error(scan.input.transforms, scan.truth, frame, true);
-    result.nominal_relative_ed_mm += nominal.ed_mm;
+    const auto mean = [](const torch::Tensor& values) { return values.mean().item<double>(); };
+    result.nominal_relative_ed_mm += mean(relative_pose_errors(scan.input.transforms, scan.truth, frame).ed);
     const auto steps = recipe_->network().run(scan.input, validation_->grid(), {});
     for (std::size_t k = 0; k < steps.size(); ++k) {
-      const PoseError absolute = pose_error(steps[k].transforms, scan.truth, frame, false);
-      const PoseError relative = pose_error(steps[k].transforms, scan.truth, frame, true);
-      add(result.ed_mm, k, absolute.ed_mm);
-      add(result.gd_rad, k, absolute.gd_rad);
-      add(result.relative_ed_mm, k, relative.ed_mm);
-      add(result.relative_gd_rad, k, relative.gd_rad);
+      const PoseErrors absolute = pose_errors(steps[k].transforms, scan.truth, frame);
+      const PoseErrors relative = relative_pose_errors(steps[k].transforms, scan.truth, frame);
+      add(result.ed_mm, k, mean(absolute.ed));
+      add(result.gd_rad, k, mean(absolute.gd));
+      add(result.relative_ed_mm, k, mean(relative.ed));
+      add(result.relative_gd_rad, k, mean(relative.gd));
     }
   }
   exchange_average();
