@@ -221,6 +221,7 @@ int run(int argc, char** argv) {
     write_weights(output, network, trainer, provenance);
     plot_logs(output, recipe->parts());
   };
+  hooks.validated = [&](const ValidationResult&) { plot_logs(output, recipe->parts()); };
   trainer.run(hooks, minutes);
   return 0;
 }
