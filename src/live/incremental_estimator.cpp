@@ -1,9 +1,11 @@
 #include "svort_ros/live/incremental_estimator.h"
 
 #include <stdexcept>
+#include <utility>
 
 #include "svort_ros/live/network_estimator.h"
 #include "svort_ros/live/nominal_estimator.h"
+#include "svort_ros/live/registration_estimator.h"
 
 namespace svort {
 
@@ -13,14 +15,22 @@ const char* to_string(PoseStatus status) {
       return "nominal";
     case PoseStatus::network:
       return "network";
+    case PoseStatus::predicted:
+      return "predicted";
+    case PoseStatus::registered:
+      return "registered";
+    case PoseStatus::outlier:
+      return "outlier";
   }
   throw std::logic_error("unknown PoseStatus");
 }
 
-std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options) {
+std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options,
+                                                     std::vector<BrainTemplate> templates) {
+  if (options.method == "registration") return std::make_unique<RegistrationEstimator>(options, std::move(templates));
   if (options.method == "nominal") return std::make_unique<NominalEstimator>(options);
   if (options.method == "network") return std::make_unique<NetworkEstimator>(options);
-  throw std::invalid_argument("estimator.method is '" + options.method + "'; known: nominal, network");
+  throw std::invalid_argument("estimator.method is '" + options.method + "'; known: registration, network, nominal");
 }
 
 }  // namespace svort

@@ -4,8 +4,10 @@
 
 namespace svort {
 
-LivePipeline::LivePipeline(const PipelineOptions& options)
-    : options_(options), sequence_(options.sequence), estimator_(make_estimator(options.estimator)) {}
+LivePipeline::LivePipeline(const PipelineOptions& options, std::vector<BrainTemplate> templates)
+    : options_(options),
+      sequence_(options.sequence),
+      estimator_(make_estimator(options.estimator, std::move(templates))) {}
 
 void LivePipeline::set_scan_end_callback(std::function<void(const LivePipeline&)> callback) {
   on_scan_end_ = std::move(callback);

@@ -24,30 +24,6 @@ namespace {
 constexpr double kFwhmPerSigma = 2.354820045;
 constexpr double kInPlaneFwhm = 1.2;  // pixels (paper, sec. 2)
 
-void check(const RefinementOptions& options) {
-  const auto require = [](bool condition, const char* name, double value, const char* range) {
-    if (condition) return;
-    std::ostringstream message;
-    message << "registration." << name << " is " << value << "; it must be " << range;
-    throw std::invalid_argument(message.str());
-  };
-  require(options.finest_mm >= 0.5 && options.finest_mm <= 4., "finest_mm", options.finest_mm, "from 0.5 to 4 mm");
-  require(options.step_mm > 0. && options.step_mm <= 100., "step_mm", options.step_mm, "above 0, at most 100 mm");
-  require(options.jump_mm > 0., "jump_mm", options.jump_mm, "positive");
-  require(options.stack_gap_factor >= 0., "stack_gap_factor", options.stack_gap_factor, "zero or positive");
-  require(options.lever_mm > 0., "lever_mm", options.lever_mm, "positive");
-  require(options.image_scale > 0., "image_scale", options.image_scale, "positive");
-  require(options.image_trust > 0. && options.image_trust <= 1., "image_trust", options.image_trust,
-          "above 0, at most 1");
-  require(options.one_stack_trust > 0. && options.one_stack_trust <= 1., "one_stack_trust", options.one_stack_trust,
-          "above 0, at most 1");
-  require(options.largest_step_mm > 0., "largest_step_mm", options.largest_step_mm, "positive");
-  require(options.outlier_ncc >= -1. && options.outlier_ncc < 1., "outlier_ncc", options.outlier_ncc,
-          "from -1 to below 1");
-  require(options.stack_passes >= 0, "stack_passes", options.stack_passes, "zero or positive");
-  require(options.trajectory_passes >= 0, "trajectory_passes", options.trajectory_passes, "zero or positive");
-}
-
 AcquisitionGeometry geometry_of(const std::vector<Pose>& poses, const std::vector<double>& thickness_mm,
                                 double pixel_mm, double voxel_mm) {
   AcquisitionGeometry geometry;
@@ -104,7 +80,7 @@ class Refiner {
     }
   }
 
-  Refinement run() {
+  Refinement run(RefinementEffort effort) {
     // Coarse to fine; the volume is blurred as the slices are. The coarsest level catches motions of centimetres.
     const double middle = std::max(2., options_.finest_mm), coarse = 2. * middle;
     const int passes = options_.trajectory_passes;
@@ -115,6 +91,8 @@ class Refiner {
                                    {middle, middle, passes, false},
                                    {middle, 0.5 * middle, passes, false}};
     if (options_.finest_mm < middle) plan.push_back({options_.finest_mm, 0., passes, false});
+    if (effort == RefinementEffort::warm)
+      plan = {{middle, 2. * middle, 1, true}, {middle, middle, 1, false}, {middle, 0.5 * middle, 1, false}};
     for (const LevelPlan& level : plan)
       if (level.passes > 0) run_level(level);
 
@@ -280,15 +258,39 @@ class Refiner {
 
 }  // namespace
 
+void validate(const RefinementOptions& options) {
+  const auto require = [](bool condition, const char* name, double value, const char* range) {
+    if (condition) return;
+    std::ostringstream message;
+    message << "registration." << name << " is " << value << "; it must be " << range;
+    throw std::invalid_argument(message.str());
+  };
+  require(options.finest_mm >= 0.5 && options.finest_mm <= 4., "finest_mm", options.finest_mm, "from 0.5 to 4 mm");
+  require(options.step_mm > 0. && options.step_mm <= 100., "step_mm", options.step_mm, "above 0, at most 100 mm");
+  require(options.jump_mm > 0., "jump_mm", options.jump_mm, "positive");
+  require(options.stack_gap_factor >= 0., "stack_gap_factor", options.stack_gap_factor, "zero or positive");
+  require(options.lever_mm > 0., "lever_mm", options.lever_mm, "positive");
+  require(options.image_scale > 0., "image_scale", options.image_scale, "positive");
+  require(options.image_trust > 0. && options.image_trust <= 1., "image_trust", options.image_trust,
+          "above 0, at most 1");
+  require(options.one_stack_trust > 0. && options.one_stack_trust <= 1., "one_stack_trust", options.one_stack_trust,
+          "above 0, at most 1");
+  require(options.largest_step_mm > 0., "largest_step_mm", options.largest_step_mm, "positive");
+  require(options.outlier_ncc >= -1. && options.outlier_ncc < 1., "outlier_ncc", options.outlier_ncc,
+          "from -1 to below 1");
+  require(options.stack_passes >= 0, "stack_passes", options.stack_passes, "zero or positive");
+  require(options.trajectory_passes >= 0, "trajectory_passes", options.trajectory_passes, "zero or positive");
+}
+
 Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
-                        const RefinementOptions& options) {
+                        const RefinementOptions& options, RefinementEffort effort) {
   validate(input);
-  check(options);
+  validate(options);
   if (start.size() != input.count())
     throw std::invalid_argument("registration: " + std::to_string(start.size()) + " start poses for " +
                                 std::to_string(input.count()) + " slices");
   const torch::NoGradGuard no_grad;
-  return Refiner(input, start, options).run();
+  return Refiner(input, start, options).run(effort);
 }
 
 torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::vector<Pose>& poses,

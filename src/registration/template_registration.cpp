@@ -19,23 +19,6 @@ namespace {
 
 constexpr double kBrainShare = 0.25;  // of the bright tissue: brain, not rim
 
-void check(const TemplateOptions& options) {
-  const auto require = [](bool condition, const char* name, double value, const char* range) {
-    if (condition) return;
-    std::ostringstream message;
-    message << "template." << name << " is " << value << "; it must be " << range;
-    throw std::invalid_argument(message.str());
-  };
-  require(options.voxel_mm >= 1. && options.voxel_mm <= 8., "voxel_mm", options.voxel_mm, "from 1 to 8 mm");
-  require(options.blur_mm >= 0. && options.blur_mm <= 20., "blur_mm", options.blur_mm, "from 0 to 20 mm");
-  require(options.rotations >= 24 && options.rotations <= 1000000, "rotations", options.rotations,
-          "from 24 to 1,000,000");
-  require(options.refined >= 1 && options.refined <= 1000, "refined", options.refined, "from 1 to 1000");
-  require(options.samples >= 100, "samples", options.samples, "at least 100");
-  require(options.distinct_deg > 0. && options.distinct_deg < 180., "distinct_deg", options.distinct_deg,
-          "between 0 and 180 degrees");
-}
-
 float bright_of(const Volume& volume) {
   std::vector<float> positive;
   for (const float value : volume.values)
@@ -290,6 +273,23 @@ Shape checked_shape(const Volume& volume, const std::string& name) {
 
 }  // namespace
 
+void validate(const TemplateOptions& options) {
+  const auto require = [](bool condition, const char* name, double value, const char* range) {
+    if (condition) return;
+    std::ostringstream message;
+    message << "template." << name << " is " << value << "; it must be " << range;
+    throw std::invalid_argument(message.str());
+  };
+  require(options.voxel_mm >= 1. && options.voxel_mm <= 8., "voxel_mm", options.voxel_mm, "from 1 to 8 mm");
+  require(options.blur_mm >= 0. && options.blur_mm <= 20., "blur_mm", options.blur_mm, "from 0 to 20 mm");
+  require(options.rotations >= 24 && options.rotations <= 1000000, "rotations", options.rotations,
+          "from 24 to 1,000,000");
+  require(options.refined >= 1 && options.refined <= 1000, "refined", options.refined, "from 1 to 1000");
+  require(options.samples >= 100, "samples", options.samples, "at least 100");
+  require(options.distinct_deg > 0. && options.distinct_deg < 180., "distinct_deg", options.distinct_deg,
+          "between 0 and 180 degrees");
+}
+
 double brain_volume_mm3(const Volume& volume) { return shape_of(volume).volume_mm3; }
 
 std::vector<std::size_t> nearest_templates(const std::vector<BrainTemplate>& templates, double volume_mm3, int count) {
@@ -304,7 +304,7 @@ std::vector<std::size_t> nearest_templates(const std::vector<BrainTemplate>& tem
 }
 
 TemplateMatch match_template(const Volume& volume, const BrainTemplate& target, const TemplateOptions& options) {
-  check(options);
+  validate(options);
   const Shape of_volume = checked_shape(volume, "the volume");
   const Shape of_target = checked_shape(target.volume, "template " + target.name);
   const SampledVolume there = centred(volume, of_volume, options);

@@ -261,6 +261,15 @@ SequenceEstimate to_msg(const svort::Estimate& estimate, const std::string& scan
       case svort::PoseStatus::network:
         pose.status = SlicePose::NETWORK;
         break;
+      case svort::PoseStatus::predicted:
+        pose.status = SlicePose::PREDICTED;
+        break;
+      case svort::PoseStatus::registered:
+        pose.status = SlicePose::REGISTERED;
+        break;
+      case svort::PoseStatus::outlier:
+        pose.status = SlicePose::OUTLIER;
+        break;
     }
     message.slices.push_back(pose);
   }

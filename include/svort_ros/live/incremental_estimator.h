@@ -7,14 +7,19 @@
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/geometry/pose.h"
+#include "svort_ros/registration/pose_refinement.h"
+#include "svort_ros/registration/template_registration.h"
 #include "svort_ros/sequence/slice_sequence.h"
 
 namespace svort {
 
 /// Where a slice's pose comes from.
 enum class PoseStatus {
-  nominal,  ///< the scanner's own prescription; the head is assumed not to have moved
-  network,  ///< a network's answer
+  nominal,     ///< the scanner's own prescription; the head is assumed not to have moved
+  predicted,   ///< the prescription, moved as the head had moved at the slice before; not registered yet
+  registered,  ///< registered to the volume, with the head's motion as one trajectory
+  outlier,     ///< registered as well, but the slice fits nowhere: its weight is 0
+  network,     ///< a network's answer
 };
 const char* to_string(PoseStatus status);
 
@@ -28,6 +33,7 @@ struct SliceEstimate {
   /// estimated with the slice in it. The slice is part of that volume, so this is an upper bound.
   double ncc = 0.;
   PoseStatus status = PoseStatus::nominal;
+  std::string reason;  ///< why the weight is 0; empty otherwise
 };
 
 /// One published state. All poses belong together; the volume may be from an earlier revision.
@@ -64,7 +70,8 @@ struct NetworkEstimatorOptions {
 };
 
 struct EstimatorOptions {
-  std::string method = "nominal";     ///< which implementation; see make_estimator
+  std::string method = "registration";  ///< which implementation; see make_estimator
+  std::string templates;  ///< folder of NIfTI brains in canonical orientation; empty: the frame has the scanner's axes
   std::string formulation = "fast";   ///< of the forward model; "exact" to match the public implementation to rounding
   double volume_resolution_mm = 1.0;  ///< voxel size of the volume
   double volume_size_mm = 128.0;      ///< edge of the cube that is reconstructed, centred on the brain frame
@@ -73,10 +80,13 @@ struct EstimatorOptions {
   /// The same, in finalise(). More sharpen the volume where poses are right, and fit noise and motion where not.
   int final_cg_iterations = 2;
   NetworkEstimatorOptions network;
+  RefinementOptions registration;
+  TemplateOptions template_match;
 
   template <class Visitor>
   void visit(Visitor&& v) {
-    v("method", method, "estimator: nominal (the scanner's own poses, no motion estimate) or network");
+    v("method", method, "registration (of slices to the volume), network, or nominal (the scanner's poses, no motion)");
+    v("templates", templates, "folder of NIfTI brains in canonical orientation (LPS); empty: scanner's axes");
     v("formulation", formulation, "forward model: fast, or exact (every tap of the slice profile, ten times slower)");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume, mm");
     v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
@@ -84,6 +94,8 @@ struct EstimatorOptions {
     v("cg_iterations", cg_iterations, "conjugate-gradient steps per volume while slices arrive; 0: PSF reconstruction");
     v("final_cg_iterations", final_cg_iterations, "conjugate-gradient steps of the final volume");
     v.section("network", network);
+    v.section("registration", registration);
+    v.section("template_match", template_match);
   }
 };
 
@@ -121,8 +133,10 @@ class IncrementalEstimator {
   virtual EstimatorNotes notes() const { return {}; }
 };
 
+/// @param templates brains that EstimatorOptions::templates names; whoever reads files loads them (see load_templates)
 /// @throws std::invalid_argument naming the option if a value is out of range or the method is unknown
 /// @throws std::runtime_error naming the file of weights and what is wrong with it
-std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options);
+std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options,
+                                                     std::vector<BrainTemplate> templates = {});
 
 }  // namespace svort

@@ -3,6 +3,7 @@
 #include <functional>
 #include <memory>
 #include <string>
+#include <vector>
 
 #include "svort_ros/live/incremental_estimator.h"
 #include "svort_ros/live/journal.h"
@@ -29,7 +30,8 @@ struct PipelineOptions {
 class LivePipeline {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
-  explicit LivePipeline(const PipelineOptions& options);
+  /// @param templates see make_estimator()
+  explicit LivePipeline(const PipelineOptions& options, std::vector<BrainTemplate> templates = {});
 
   /// Called by add() when a slice with a new scan id ends the current scan, after finalise() and before the scan is
   /// forgotten: the last chance to save it.

@@ -43,6 +43,12 @@ struct RefinementOptions {
   }
 };
 
+/// How much refine_poses() does.
+enum class RefinementEffort {
+  full,  ///< from the coarsest level on: start poses may be centimetres off
+  warm,  ///< one volume for each of the two middle levels: start poses come from an earlier refinement
+};
+
 /// What refinement knows about one slice.
 struct RefinedSlice {
   Pose T_brain_slice = Pose::Identity();
@@ -79,7 +85,10 @@ struct Refinement {
 /// @return same bytes for any number of threads
 /// @throws std::invalid_argument naming what does not fit
 Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
-                        const RefinementOptions& options = {});
+                        const RefinementOptions& options = {}, RefinementEffort effort = RefinementEffort::full);
+
+/// @throws std::invalid_argument naming the option that is out of range
+void validate(const RefinementOptions& options);
 
 /// Weighted PSF reconstruction, the volume that refinement registers to.
 ///

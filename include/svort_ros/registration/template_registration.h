@@ -52,6 +52,9 @@ struct TemplateMatch {
   std::string template_name;
 };
 
+/// @throws std::invalid_argument naming the option that is out of range
+void validate(const TemplateOptions& options);
+
 /// Brain volume (mm^3): the voxels above a quarter of the 0.99 quantile of the positive ones, holes included.
 double brain_volume_mm3(const Volume& volume);
 

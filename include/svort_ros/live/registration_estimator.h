@@ -1,0 +1,52 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "svort_ros/acquisition/slice_acquisition.h"
+#include "svort_ros/live/incremental_estimator.h"
+
+namespace svort {
+
+/// Head motion without any trained weights: slices are registered to the volume that they form, the head's motion as
+/// one trajectory in acquisition order (see refine_poses), and the whole to a template, if there is one.
+///
+/// add() takes the new slice's pose from the head's motion at its neighbour in time and refines all poses; finalise()
+/// refines from the coarsest level on, from these poses and from the scanner's, and keeps what fits better. Poses
+/// depend on the slices and their order alone.
+///
+/// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
+/// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
+/// by the poses of the slices that are already there.
+class RegistrationEstimator : public IncrementalEstimator {
+ public:
+  /// @param templates brains in canonical orientation; may be empty
+  /// @throws std::invalid_argument naming the option that is out of range
+  RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates);
+
+  void add(const SliceSequence& sequence) override;
+  void update_volume(const SliceSequence& sequence) override;
+  void finalise(const SliceSequence& sequence) override;
+  void reset() override;
+  const Estimate& estimate() const override { return estimate_; }
+  const Volume& volume() const override { return volume_; }
+  std::string device() const override { return "cpu"; }
+
+ private:
+  RegistrationInput input_of(const SliceSequence& sequence) const;
+  std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
+  void take(const SliceSequence& sequence, const Refinement& refinement, const std::vector<Pose>& before);
+  void align_to_template(const SliceSequence& sequence);
+  void move_frame(const Pose& T_new_old);
+
+  EstimatorOptions options_;
+  AcquisitionFormulation formulation_;
+  ImageGrid grid_;
+  std::vector<BrainTemplate> templates_;
+  Estimate estimate_;
+  Volume volume_;
+  bool aligned_ = false;           ///< the frame is the canonical one
+  std::size_t aligned_count_ = 0;  ///< slices when that was last tried
+};
+
+}  // namespace svort

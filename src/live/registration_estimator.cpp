@@ -1,0 +1,209 @@
+#include "svort_ros/live/registration_estimator.h"
+
+#include <torch/torch.h>
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+
+#include "svort_ros/live/volume_update.h"
+
+namespace svort {
+namespace {
+
+constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to register to
+constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
+constexpr std::size_t kSlicesBetweenMatches = 15;
+constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
+
+/// The rigid motion that brings the planes `from` closest to `to`, by the corners of their fields.
+Pose best_fit(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm) {
+  const auto n = static_cast<Eigen::Index>(from.size());
+  Eigen::Matrix3Xd a(3, 3 * n), b(3, 3 * n);
+  for (Eigen::Index i = 0; i < n; ++i) {
+    const auto k = static_cast<std::size_t>(i);
+    const Eigen::Vector3d corner[] = {
+        {-half_field_mm, -half_field_mm, 0.}, {0., 0., 0.}, {half_field_mm, -half_field_mm, 0.}};
+    for (Eigen::Index j = 0; j < 3; ++j) {
+      a.col(3 * i + j) = from[k] * corner[j];
+      b.col(3 * i + j) = to[k] * corner[j];
+    }
+  }
+  return Pose(Eigen::umeyama(a, b, false));
+}
+
+}  // namespace
+
+RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates)
+    : options_(options), templates_(std::move(templates)) {
+  svort::validate(options);
+  validate(options.registration);
+  validate(options.template_match);
+  formulation_ = acquisition_formulation(options.formulation);
+  grid_ = volume_grid(options);
+}
+
+RegistrationInput RegistrationEstimator::input_of(const SliceSequence& sequence) const {
+  const auto& slices = sequence.slices();
+  const auto count = static_cast<std::int64_t>(slices.size());
+  const std::int64_t size = sequence.options().size_px;
+  const auto intensity = static_cast<float>(1. / sequence.intensity_scale());
+  RegistrationInput input;
+  input.slices = torch::empty({count, 1, size, size}, torch::kFloat32);
+  input.masks = torch::empty({count, 1, size, size}, torch::kBool);
+  input.resolution_mm = sequence.options().resolution_mm;
+  const auto plane = static_cast<std::size_t>(size * size);
+  // Nominal poses around the brain: the frame only has to be a fixed one near its centre.
+  const Eigen::Vector3d centre = slices.front()->info.T_scanner_slice.translation();
+  for (std::size_t i = 0; i < slices.size(); ++i) {
+    const PreparedSlice& slice = *slices[i];
+    std::transform(slice.pixels.begin(), slice.pixels.end(), input.slices.data_ptr<float>() + i * plane,
+                   [intensity](float value) { return value * intensity; });
+    std::transform(slice.mask.begin(), slice.mask.end(), input.masks.data_ptr<bool>() + i * plane,
+                   [](std::uint8_t value) { return value != 0; });
+    Pose nominal = slice.info.T_scanner_slice * slice.T_slice_crop;
+    nominal.translation() -= centre;
+    input.T_world_slice.push_back(nominal);
+    input.stack.push_back(slice.info.stack);
+    input.time_s.push_back(static_cast<double>(slice.info.stamp_ns - slices.front()->info.stamp_ns) * 1e-9);
+    input.thickness_mm.push_back(slice.info.thickness);
+  }
+  return input;
+}
+
+std::vector<Pose> RegistrationEstimator::crop_poses(const SliceSequence& sequence) const {
+  std::vector<Pose> poses;
+  for (std::size_t i = 0; i < estimate_.slices.size(); ++i)
+    poses.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
+  return poses;
+}
+
+void RegistrationEstimator::add(const SliceSequence& sequence) {
+  const auto newest = sequence.newest_arrival();
+  if (!newest) throw std::logic_error("RegistrationEstimator::add: the sequence holds no slice");
+  const auto& ordered = sequence.slices();
+  const auto position = static_cast<std::size_t>(std::find(ordered.begin(), ordered.end(), newest) - ordered.begin());
+
+  SliceEstimate slice;
+  slice.info = newest->info;
+  slice.ncc = std::numeric_limits<double>::quiet_NaN();
+  std::vector<SliceEstimate>& slices = estimate_.slices;
+  if (slices.empty()) {
+    slice.T_scanner_brain.translation() =
+        sequence.brain_roi().empty() ? newest->info.T_scanner_slice.translation() : sequence.brain_roi().centre();
+    slice.status = PoseStatus::nominal;
+  } else {
+    slice.T_scanner_brain = slices[position > 0 ? position - 1 : 0].T_scanner_brain;
+    slice.status = PoseStatus::predicted;
+  }
+  slice.T_brain_slice = slice.T_scanner_brain.inverse() * slice.info.T_scanner_slice;
+  slices.insert(slices.begin() + static_cast<std::ptrdiff_t>(position), slice);
+
+  // The origin follows the brain's centre while the first slices show where that is.
+  if (!aligned_ && !sequence.brain_roi().empty() && slices.size() > 1) {
+    const Eigen::Vector3d centre = slices[position].T_scanner_brain.inverse() * sequence.brain_roi().centre();
+    if (centre.norm() > options_.recentre_mm) {
+      Pose T_new_old = Pose::Identity();
+      T_new_old.translation() = -centre;
+      move_frame(T_new_old);
+    }
+  }
+  if (slices.size() >= kFewestSlices) {
+    const std::vector<Pose> start = crop_poses(sequence);
+    take(sequence, refine_poses(input_of(sequence), start, options_.registration, RefinementEffort::warm), start);
+    const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
+    if (slices.size() >= kFewestForTemplate &&
+        (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches)))
+      align_to_template(sequence);
+  }
+  estimate_.scan_id = sequence.scan_id();
+  estimate_.final = false;
+  ++estimate_.revision;
+}
+
+void RegistrationEstimator::take(const SliceSequence& sequence, const Refinement& refinement,
+                                 const std::vector<Pose>& before) {
+  // Registration sees relative motion only: the slices that were here hold the frame where it was.
+  std::vector<Pose> after;
+  for (const RefinedSlice& each : refinement.slices) after.push_back(each.T_brain_slice);
+  const double half_field = 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
+  const Pose held = best_fit(after, before, half_field);
+  for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
+    SliceEstimate& slice = estimate_.slices[i];
+    const RefinedSlice& refined = refinement.slices[i];
+    slice.T_brain_slice = held * refined.T_brain_slice * sequence.slices()[i]->T_slice_crop.inverse();
+    slice.T_scanner_brain = slice.info.T_scanner_slice * slice.T_brain_slice.inverse();
+    slice.weight = refined.weight;
+    slice.reason = refined.reason;
+    slice.status = refined.weight > 0. ? PoseStatus::registered : PoseStatus::outlier;
+  }
+}
+
+void RegistrationEstimator::move_frame(const Pose& T_new_old) {
+  for (SliceEstimate& slice : estimate_.slices) {
+    slice.T_brain_slice = T_new_old * slice.T_brain_slice;
+    slice.T_scanner_brain = slice.T_scanner_brain * T_new_old.inverse();
+  }
+  ++estimate_.frame_revision;
+}
+
+void RegistrationEstimator::align_to_template(const SliceSequence& sequence) {
+  aligned_count_ = estimate_.slices.size();
+  if (templates_.empty()) return;
+  const double voxel = options_.template_match.voxel_mm;
+  Volume rough;
+  rough.grid.size.setConstant(static_cast<int>(std::lround(options_.volume_size_mm / voxel)));
+  rough.grid.spacing.setConstant(voxel);
+  std::vector<double> weights;
+  for (const SliceEstimate& slice : estimate_.slices) weights.push_back(slice.weight);
+  const torch::Tensor volume =
+      reconstruct_weighted(input_of(sequence), crop_poses(sequence), weights, rough.grid.size.x(), voxel);
+  rough.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
+  const double brain = brain_volume_mm3(rough);
+  if (!(brain > 0.)) return;
+  const BrainTemplate& nearest = templates_[nearest_templates(templates_, brain, 1).front()];
+  const TemplateMatch match = match_template(rough, nearest, options_.template_match);
+  if (!match.sure) return;
+  const bool small = rotation_angle(match.T_template_volume) < kFrameAngle &&
+                     match.T_template_volume.translation().norm() < kFrameShiftMm;
+  if (!aligned_ || !small) move_frame(match.T_template_volume);
+  aligned_ = true;
+}
+
+void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
+  volume_ = estimate_volume(sequence, grid_, formulation_, options_.cg_iterations, &estimate_.slices);
+  ++estimate_.revision;
+}
+
+void RegistrationEstimator::finalise(const SliceSequence& sequence) {
+  if (estimate_.slices.size() >= kFewestSlices) {
+    const RegistrationInput input = input_of(sequence);
+    const std::vector<Pose> current = crop_poses(sequence);
+    // From the scanner's poses as well: what was learnt on the way may have led astray.
+    const Pose T_brain_world = best_fit(input.T_world_slice, current, 64.);
+    std::vector<Pose> nominal;
+    for (const Pose& pose : input.T_world_slice) nominal.push_back(T_brain_world * pose);
+    const Refinement from_current = refine_poses(input, current, options_.registration);
+    const Refinement from_nominal = refine_poses(input, nominal, options_.registration);
+    take(sequence, from_current.report.last_cost <= from_nominal.report.last_cost ? from_current : from_nominal,
+         current);
+    align_to_template(sequence);
+  }
+  volume_ = estimate_volume(sequence, grid_, formulation_, options_.final_cg_iterations, &estimate_.slices);
+  estimate_.final = true;
+  ++estimate_.revision;
+}
+
+void RegistrationEstimator::reset() {
+  const std::uint64_t revision = estimate_.revision;
+  estimate_ = Estimate();
+  estimate_.revision = revision;
+  volume_ = Volume();
+  aligned_ = false;
+  aligned_count_ = 0;
+}
+
+}  // namespace svort
