@@ -98,6 +98,11 @@ std::string run_json(const LivePipeline& pipeline, const RunInfo& run) {
   if (!notes.warnings.empty()) json["estimator"]["warnings"] = notes.warnings;
   if (pipeline.options().estimator.method == "nominal")
     json["estimator"]["note"] = "poses are the scanner's prescription; no motion was estimated and no network was used";
+  Json outliers = Json::array();
+  for (const SliceEstimate& slice : pipeline.estimate().slices)
+    if (!slice.reason.empty())
+      outliers.push_back({{"stack", slice.info.stack}, {"slice", slice.info.index}, {"reason", slice.reason}});
+  json["outliers"] = outliers;
   json["slices"] = sequence.slices().size();
   json["revision"] = pipeline.estimate().revision;
   json["final"] = pipeline.estimate().final;

@@ -47,15 +47,22 @@ AcquisitionGeometry geometry_of(const std::vector<Pose>& poses, const std::vecto
   return geometry;
 }
 
-torch::Tensor weighted_volume(const torch::Tensor& slices, const torch::Tensor& masks, const std::vector<Pose>& poses,
-                              const std::vector<double>& thickness_mm, const std::vector<double>& weights,
-                              double pixel_mm, std::int64_t size, double voxel_mm) {
-  const AcquisitionGeometry geometry = geometry_of(poses, thickness_mm, pixel_mm, voxel_mm);
-  const SliceAcquisition acquisition(geometry, static_cast<int>(slices.size(2)), static_cast<int>(slices.size(3)),
-                                     {size, size, size}, AcquisitionFormulation::fast, {masks, {}});
+SliceAcquisition acquisition_of(const torch::Tensor& slices, const torch::Tensor& masks, const std::vector<Pose>& poses,
+                                const std::vector<double>& thickness_mm, double pixel_mm, std::int64_t size,
+                                double voxel_mm) {
+  return SliceAcquisition(geometry_of(poses, thickness_mm, pixel_mm, voxel_mm), static_cast<int>(slices.size(2)),
+                          static_cast<int>(slices.size(3)), {size, size, size}, AcquisitionFormulation::fast,
+                          {masks, {}});
+}
+
+torch::Tensor tensor_of(const std::vector<double>& weights) {
   torch::Tensor w = torch::empty({static_cast<std::int64_t>(weights.size())}, torch::kFloat32);
   for (std::size_t i = 0; i < weights.size(); ++i) w.data_ptr<float>()[i] = static_cast<float>(weights[i]);
-  return reconstruct_psf(slices, acquisition, w);
+  return w;
+}
+
+std::vector<float> values_of(const torch::Tensor& volume) {
+  return std::vector<float>(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
 }
 
 struct LevelPlan {
@@ -123,6 +130,7 @@ class Refiner {
         else
           step_trajectory();
       }
+      return_strays();
       evaluate();
       weigh();
       report_.last_cost = mean_cost();
@@ -141,11 +149,65 @@ class Refiner {
     const auto size = static_cast<std::int64_t>(std::ceil(2. * std::min(radius, 90.) / level_.pixel_mm)) + 6;
     std::vector<double> weights;
     for (const RefinedSlice& slice : slices_) weights.push_back(slice.weight);
-    const torch::Tensor volume = weighted_volume(level_.slices, level_.masks, poses_, input_.thickness_mm, weights,
-                                                 level_.pixel_mm, size, level_.pixel_mm);
-    std::vector<float> values(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
-    volume_ = SampledVolume(blurred(std::move(values), static_cast<int>(size), kInPlaneFwhm / kFwhmPerSigma),
-                            static_cast<int>(size), level_.pixel_mm);
+    const torch::Tensor w = tensor_of(weights).view({-1, 1, 1, 1});
+    const SliceAcquisition acquisition = acquisition_of(level_.slices, level_.masks, poses_, input_.thickness_mm,
+                                                        level_.pixel_mm, size, level_.pixel_mm);
+    const torch::Tensor total = acquisition.adjoint(w.expand_as(level_.slices).contiguous(), false);
+    const torch::Tensor sums = acquisition.adjoint((level_.slices * w).contiguous(), false);
+    const float least = 1e-3F * std::max(1e-12F, total.max().item<float>());
+    const torch::Tensor volume = torch::where(total > least, sums / total.clamp_min(least), torch::zeros_like(sums));
+    const double sigma = kInPlaneFwhm / kFwhmPerSigma;
+    volume_ = SampledVolume(blurred(values_of(volume), static_cast<int>(size), sigma), static_cast<int>(size),
+                            level_.pixel_mm);
+    if (one_stack_) return;
+    support_ = SampledVolume(values_of(total), static_cast<int>(size), level_.pixel_mm);
+
+    // What a slice of weight 1 gives to the voxels of its own plane, alone.
+    const auto largest = static_cast<std::int64_t>(
+        std::max_element(level_.points.begin(), level_.points.end(),
+                         [](const SlicePoints& x, const SlicePoints& y) { return x.value.size() < y.value.size(); }) -
+        level_.points.begin());
+    const auto index = static_cast<std::size_t>(largest);
+    const torch::Tensor one = level_.slices.narrow(0, largest, 1), mask = level_.masks.narrow(0, largest, 1);
+    const torch::Tensor alone = acquisition_of(one, mask.contiguous(), {poses_[index]}, {input_.thickness_mm[index]},
+                                               level_.pixel_mm, size, level_.pixel_mm)
+                                    .adjoint(torch::ones_like(one), false);
+    const SampledVolume own(values_of(alone), static_cast<int>(size), level_.pixel_mm);
+    own_support_ = mean_support(own, index);
+  }
+
+  double mean_support(const SampledVolume& support, std::size_t slice) const {
+    const SlicePoints& points = level_.points[slice];
+    if (points.value.empty()) return 0.;
+    const Eigen::Affine3f pose = poses_[slice].cast<float>();
+    double sum = 0.;
+    for (const Eigen::Vector2f& p : points.position) sum += support.at(pose * Eigen::Vector3f(p.x(), p.y(), 0.F)).value;
+    return sum / static_cast<double>(points.value.size());
+  }
+
+  /// A slice that has left the others fits itself perfectly, wherever it is. It goes where its neighbour in time says
+  /// that the head was.
+  void return_strays() {
+    if (one_stack_) return;
+    constexpr double kOwnShare = 0.8;
+    std::vector<bool> stray(poses_.size());
+    for (std::size_t i = 0; i < poses_.size(); ++i)
+      stray[i] = slices_[i].weight > 0. && slices_[i].weight * own_support_ > kOwnShare * mean_support(support_, i);
+    const std::vector<Pose> found = poses_;
+    for (std::size_t i = 0; i < poses_.size(); ++i) {
+      if (!stray[i]) continue;
+      for (std::size_t distance = 1; distance < poses_.size(); ++distance) {
+        const auto usable = [&](std::size_t j) { return input_.stack[j] == input_.stack[i] && !stray[j]; };
+        std::size_t from = i;
+        if (i >= distance && usable(i - distance))
+          from = i - distance;
+        else if (i + distance < poses_.size() && usable(i + distance))
+          from = i + distance;
+        if (from == i) continue;
+        poses_[i] = found[from] * input_.T_world_slice[from].inverse() * input_.T_world_slice[i];
+        break;
+      }
+    }
   }
 
   void evaluate() {
@@ -252,7 +314,8 @@ class Refiner {
   RegistrationLevel level_;
   bool one_stack_ = false;
   double level_pixel_ = 0., level_blur_ = 0.;
-  SampledVolume volume_;
+  SampledVolume volume_, support_;  ///< support: sum of the weights that each voxel received
+  double own_support_ = 0.;
   RefinementReport report_;
 };
 
@@ -299,8 +362,10 @@ torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::ve
   if (poses.size() != input.count() || weights.size() != input.count())
     throw std::invalid_argument("registration: poses and weights must have one entry per slice");
   const torch::NoGradGuard no_grad;
-  return weighted_volume(input.slices, input.masks, poses, input.thickness_mm, weights, input.resolution_mm, size,
-                         voxel_mm);
+  return reconstruct_psf(
+      input.slices * input.masks,
+      acquisition_of(input.slices, input.masks, poses, input.thickness_mm, input.resolution_mm, size, voxel_mm),
+      tensor_of(weights));
 }
 
 }  // namespace svort

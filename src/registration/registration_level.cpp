@@ -53,19 +53,17 @@ void validate(const RegistrationInput& input) {
 
 RegistrationLevel make_level(const RegistrationInput& input, double pixel_mm, double blur_mm) {
   const torch::NoGradGuard no_grad;
-  const auto factor = std::max<std::int64_t>(1, std::llround(pixel_mm / input.resolution_mm));
+  auto factor = std::max<std::int64_t>(1, std::llround(pixel_mm / input.resolution_mm));
+  const auto divides = [&](std::int64_t size) { return size >= factor && size % factor % 2 == 0; };
+  while (!divides(input.slices.size(2)) || !divides(input.slices.size(3))) --factor;
   RegistrationLevel level;
   level.pixel_mm = input.resolution_mm * static_cast<double>(factor);
   torch::Tensor share = input.masks.to(torch::kFloat32);
   torch::Tensor sums = input.slices * share;
   if (factor > 1) {
     // Cut what does not fill a whole pixel on both sides alike, so that the centre stays the centre.
-    const auto cut = [factor](std::int64_t size) { return (size % factor) / 2; };
-    const std::int64_t top = cut(sums.size(2)), left = cut(sums.size(3));
     const std::int64_t rows = sums.size(2) / factor * factor, columns = sums.size(3) / factor * factor;
-    if ((sums.size(2) - rows) % 2 != 0 || (sums.size(3) - columns) % 2 != 0)
-      reject("slices of " + std::to_string(sums.size(2)) + " x " + std::to_string(sums.size(3)) +
-             " pixels cannot be averaged by " + std::to_string(factor));
+    const std::int64_t top = (sums.size(2) - rows) / 2, left = (sums.size(3) - columns) / 2;
     const auto pooled = [&](const torch::Tensor& images) {
       return torch::avg_pool2d(images.narrow(2, top, rows).narrow(3, left, columns), factor);
     };

@@ -221,7 +221,8 @@ double angle_between(const Eigen::Matrix3d& a, const Eigen::Matrix3d& b) {
 std::pair<Candidate, std::optional<Candidate>> search(const SampledVolume& target, const SampledVolume& volume,
                                                       double log_scale, const TemplateOptions& options) {
   const double distinct = options.distinct_deg * M_PI / 180.;
-  const Points points = bright_points(target, static_cast<std::size_t>(options.samples), options.seed);
+  const Points points =
+      bright_points(target, static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
   const std::vector<Eigen::Quaterniond> rotations = spread_rotations(options.rotations);
   std::vector<Candidate> tried(rotations.size());
   parallel_chunks(static_cast<std::int64_t>(tried.size()), [&](std::int64_t begin, std::int64_t end) {
@@ -242,7 +243,8 @@ std::pair<Candidate, std::optional<Candidate>> search(const SampledVolume& targe
     });
     if (!known) chosen.push_back(candidate);
   }
-  const Points all = bright_points(target, 4 * static_cast<std::size_t>(options.samples), options.seed);
+  const Points all =
+      bright_points(target, 4 * static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
   parallel_tasks(static_cast<std::int64_t>(chosen.size()), [&](std::int64_t i) {
     Candidate& candidate = chosen[static_cast<std::size_t>(i)];
     candidate = refined(all, volume, candidate);
@@ -277,7 +279,7 @@ void validate(const TemplateOptions& options) {
   const auto require = [](bool condition, const char* name, double value, const char* range) {
     if (condition) return;
     std::ostringstream message;
-    message << "template." << name << " is " << value << "; it must be " << range;
+    message << "template_match." << name << " is " << value << "; it must be " << range;
     throw std::invalid_argument(message.str());
   };
   require(options.voxel_mm >= 1. && options.voxel_mm <= 8., "voxel_mm", options.voxel_mm, "from 1 to 8 mm");
@@ -286,6 +288,7 @@ void validate(const TemplateOptions& options) {
           "from 24 to 1,000,000");
   require(options.refined >= 1 && options.refined <= 1000, "refined", options.refined, "from 1 to 1000");
   require(options.samples >= 100, "samples", options.samples, "at least 100");
+  require(options.seed >= 0, "seed", options.seed, "zero or positive");
   require(options.distinct_deg > 0. && options.distinct_deg < 180., "distinct_deg", options.distinct_deg,
           "between 0 and 180 degrees");
 }

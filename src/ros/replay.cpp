@@ -11,6 +11,7 @@
 #include <stdexcept>
 #include <thread>
 
+#include "svort_ros/io/brain_templates.h"
 #include "svort_ros/io/options_file.h"
 #include "svort_ros/io/results.h"
 #include "svort_ros/live/live_pipeline.h"
@@ -87,7 +88,8 @@ ReplaySummary replay(const ReplayOptions& options) {
     throw std::invalid_argument("realtime is " + std::to_string(options.realtime) + "; it must be zero or positive");
   validate(options.server.node);
   svort::set_thread_count(options.server.node.threads);
-  svort::LivePipeline pipeline(options.server.pipeline);
+  svort::LivePipeline pipeline(options.server.pipeline,
+                               svort::load_templates(options.server.pipeline.estimator.templates));
   const std::vector<Slice> messages =
       options.bag.empty() ? read_messages(options.input) : read_slices(options.bag, options.topic);
 
@@ -207,7 +209,7 @@ int run_svort_replay(int argc, char** argv) {
       ->capture_default_str();
   app.add_option("--realtime", options.realtime, "1: the scanner's pace, 2: twice as fast, 0: as fast as possible")
       ->capture_default_str();
-  app.add_option("--seed", options.seed, "seed of random numbers; the estimators draw none")->capture_default_str();
+  app.add_option("--seed", options.seed, "seed of random numbers; kept in run.json")->capture_default_str();
   svort::bind_options(app, options.server.pipeline);
   return run_program(app, argc, argv, [&] {
     if (options.bag.empty() == options.input.stacks.empty())

@@ -15,6 +15,7 @@
 #include <thread>
 #include <utility>
 
+#include "svort_ros/io/brain_templates.h"
 #include "svort_ros/live/threads.h"
 #include "svort_ros/ros/arrivals.h"
 #include "svort_ros/ros/conversions.h"
@@ -62,7 +63,8 @@ class SvortServer::Worker {
   Worker(const ros::NodeHandle& nh, const ros::NodeHandle& private_nh, const ServerOptions& options)
       : options_(options),
         topic_(nh.resolveName(kSliceTopic)),
-        pipeline_(std::make_unique<svort::LivePipeline>(options.pipeline)),
+        templates_(svort::load_templates(options.pipeline.estimator.templates)),
+        pipeline_(std::make_unique<svort::LivePipeline>(options.pipeline, templates_)),
         archive_(options.node.output_directory),
         status_publisher_(ros::NodeHandle(nh).advertise<SliceStatus>(kSliceStatusTopic, 1000)),
         publisher_(nh, options.node, [this](EstimatePublisher::Product product) { subscribed(product); }),
@@ -144,6 +146,7 @@ class SvortServer::Worker {
   Inbox<Item> inbox_;
 
   // The worker's thread alone touches these.
+  const std::vector<svort::BrainTemplate> templates_;
   std::unique_ptr<svort::LivePipeline> pipeline_;
   std::uint64_t revision_offset_ = 0;  ///< of pipelines that were put aside, so that revisions go on counting
   std::set<std::string> ended_scans_;
@@ -271,7 +274,7 @@ void SvortServer::Worker::end_scan() {
       const svort::RunInfo run = run_info();
       revision_offset_ += pipeline_->estimate().revision;
       archive_.keep(std::move(pipeline_), run);
-      pipeline_ = std::make_unique<svort::LivePipeline>(options_.pipeline);
+      pipeline_ = std::make_unique<svort::LivePipeline>(options_.pipeline, templates_);
       health_.write_failed(error.what(), archive_.kept());
       ROS_ERROR("scan %s could not be written and is kept in memory until ~save succeeds: %s", scan_id.c_str(),
                 error.what());

@@ -16,6 +16,7 @@ using Results = Scratch;
 
 PipelineOptions small_options() {
   PipelineOptions options;
+  options.estimator.method = "nominal";
   options.estimator.volume_resolution_mm = 2.;
   options.estimator.volume_size_mm = 60.;
   options.estimator.final_cg_iterations = 1;

@@ -18,6 +18,7 @@ using svort_test::SyntheticScanOptions;
 
 PipelineOptions small_options() {
   PipelineOptions options;
+  options.estimator.method = "nominal";
   options.estimator.volume_resolution_mm = 2.;
   options.estimator.volume_size_mm = 96.;
   options.estimator.final_cg_iterations = 3;

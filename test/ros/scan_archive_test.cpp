@@ -13,6 +13,7 @@ namespace fs = std::filesystem;
 
 svort::PipelineOptions small_options() {
   svort::PipelineOptions options;
+  options.estimator.method = "nominal";
   options.sequence.size_px = 32;
   options.sequence.resolution_mm = 3.;
   options.estimator.volume_resolution_mm = 4.;

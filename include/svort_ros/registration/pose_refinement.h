@@ -15,7 +15,7 @@ struct RefinementOptions {
   double stack_gap_factor = 3.;  ///< how much freer the head is between stacks than within; 0: stacks are independent
   double lever_mm = 40.;         ///< distance from the centre at which rotations are measured, about a head's radius
   double image_scale = 0.12;     ///< Cauchy scale of intensity differences, as part of the 0.99 quantile
-  double image_trust = 0.02;     ///< independent measurements per pixel; lower it if poses follow noise
+  double image_trust = 0.02;     ///< independent measurements per mm^2 of slice; lower it if poses follow noise
   /// The same, as a factor, while there is one stack: its slices hardly overlap, and would gather where they look
   /// alike.
   double one_stack_trust = 0.1;
@@ -33,7 +33,7 @@ struct RefinementOptions {
     v("stack_gap_factor", stack_gap_factor, "how much freer the head is between stacks; 0: stacks are independent");
     v("lever_mm", lever_mm, "distance from the centre at which rotations are measured, mm");
     v("image_scale", image_scale, "Cauchy scale of intensity differences, as part of the 0.99 quantile");
-    v("image_trust", image_trust, "independent measurements per pixel");
+    v("image_trust", image_trust, "independent measurements per mm^2 of slice");
     v("one_stack_trust", one_stack_trust, "factor of image_trust while there is one stack only");
     v("largest_step_mm", largest_step_mm, "bound of one Gauss-Newton step of a slice, mm");
     v("convergence_mm", convergence_mm, "converged when the mean motion of the last pass is below this, mm");

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <cstdint>
 #include <string>
 #include <vector>
 
@@ -18,7 +17,7 @@ struct TemplateOptions {
   double distinct_deg = 25.;       ///< two poses further apart than this are different answers
   double least_margin = 0.03;      ///< the answer is sure if its correlation is better than the runner-up's by this
   double least_correlation = 0.5;  ///< and at least this
-  std::uint64_t seed = 1;          ///< of the samples
+  int seed = 1;                    ///< of the samples
 
   template <class Visitor>
   void visit(Visitor&& v) {

@@ -1,0 +1,188 @@
+#include "svort_ros/live/registration_estimator.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <map>
+#include <stdexcept>
+#include <string>
+
+#include "registration/registration_fixture.h"
+#include "svort_ros/live/live_pipeline.h"
+
+namespace svort {
+namespace {
+
+using svort_test::relative_error_mm;
+
+PipelineOptions quick_options() {
+  PipelineOptions options;
+  options.sequence.size_px = 48;
+  options.sequence.resolution_mm = 2.;
+  options.estimator.method = "registration";
+  options.estimator.volume_resolution_mm = 2.;
+  options.estimator.volume_size_mm = 96.;
+  options.estimator.registration.finest_mm = 2.;
+  return options;
+}
+
+/// The phantom's scan as a scanner would send it, in a scanner whose axes are not the head's.
+struct Scan {
+  std::vector<Slice> slices;
+  std::vector<Pose> truth;  ///< T_head_slice
+};
+
+Scan moving_scan(int stacks = 3) {
+  svort_test::SimulatedScanOptions options;
+  options.stacks = stacks;
+  options.between_mm = 6.;
+  const svort_test::SimulatedScan simulated = svort_test::simulated_scan(options);
+  Pose T_scanner_world = Pose::Identity();
+  T_scanner_world.linear() = Eigen::AngleAxisd(1.1, Eigen::Vector3d(1., 2., -1.).normalized()).toRotationMatrix();
+  T_scanner_world.translation() = Eigen::Vector3d(20., -35., 60.);
+  Scan scan;
+  scan.truth = simulated.truth;
+  std::map<int, int> next;
+  for (std::size_t i = 0; i < simulated.truth.size(); ++i) {
+    Slice slice;
+    slice.info.scan_id = "moving";
+    slice.info.stack = simulated.input.stack[i];
+    const int order = next[slice.info.stack]++;
+    slice.info.index = interleaved_order(options.slices, 2)[static_cast<std::size_t>(order)];
+    slice.info.slices_in_stack = options.slices;
+    slice.info.stamp_ns = std::llround((100. + simulated.input.time_s[i]) * 1e9);
+    slice.info.T_scanner_slice = T_scanner_world * simulated.input.T_world_slice[i];
+    slice.info.pixel_spacing = {2., 2.};
+    slice.info.thickness = 3.;
+    slice.info.columns = slice.info.rows = 64;
+    const auto row = static_cast<std::int64_t>(i);
+    const float* pixels = simulated.input.slices[row].data_ptr<float>();
+    slice.pixels.assign(pixels, pixels + 64 * 64);
+    for (float& value : slice.pixels) value *= 800.F;
+    const bool* mask = simulated.input.masks[row].data_ptr<bool>();
+    for (int k = 0; k < 64 * 64; ++k) slice.mask.push_back(mask[k] ? 1 : 0);
+    scan.slices.push_back(std::move(slice));
+  }
+  return scan;
+}
+
+BrainTemplate phantom_template() {
+  const torch::Tensor values = svort_test::brain_volume(48, 2.);
+  BrainTemplate brain;
+  brain.name = "phantom";
+  brain.volume.grid.size.setConstant(48);
+  brain.volume.grid.spacing.setConstant(2.);
+  brain.volume.values.assign(values.data_ptr<float>(), values.data_ptr<float>() + values.numel());
+  return brain;
+}
+
+struct Poses {
+  std::vector<Pose> estimated, nominal, truth;
+};
+
+/// Feeds the scan; `kept` says which slices were.
+Poses run(LivePipeline& pipeline, const Scan& scan, int volume_every) {
+  std::vector<Pose> truth;
+  int count = 0;
+  for (std::size_t i = 0; i < scan.slices.size(); ++i) {
+    if (!is_kept(pipeline.add(scan.slices[i]).status)) continue;
+    truth.push_back(scan.truth[i]);
+    if (volume_every > 0 && ++count % volume_every == 0) pipeline.update_volume();
+  }
+  pipeline.finalise();
+  Poses poses;
+  poses.truth = truth;
+  for (const SliceEstimate& slice : pipeline.estimate().slices) {
+    poses.estimated.push_back(slice.T_brain_slice);
+    poses.nominal.push_back(slice.info.T_scanner_slice);
+  }
+  return poses;
+}
+
+TEST(RegistrationEstimator, FollowsTheHead) {
+  const Scan scan = moving_scan();
+  LivePipeline pipeline(quick_options());
+  const Poses poses = run(pipeline, scan, 0);
+  const double nominal = relative_error_mm(poses.nominal, poses.truth);
+  const double error = relative_error_mm(poses.estimated, poses.truth);
+  EXPECT_GT(nominal, 2.) << "the scan must hold something to be found";
+  EXPECT_LT(error, 1.3) << "nominal " << nominal << " mm";
+  EXPECT_LT(error, 0.5 * nominal);
+  for (const SliceEstimate& slice : pipeline.estimate().slices) {
+    EXPECT_TRUE(slice.status == PoseStatus::registered || slice.status == PoseStatus::outlier);
+    EXPECT_EQ(slice.status == PoseStatus::outlier, slice.weight == 0.);
+    EXPECT_EQ(slice.status == PoseStatus::outlier, !slice.reason.empty());
+    // What tf composes is the scanner's prescription again.
+    EXPECT_TRUE((slice.T_scanner_brain * slice.T_brain_slice).isApprox(slice.info.T_scanner_slice, 1e-9));
+  }
+}
+
+TEST(RegistrationEstimator, FindsTheCanonicalFrameWithATemplate) {
+  const Scan scan = moving_scan();
+  LivePipeline pipeline(quick_options(), {phantom_template()});
+  const Poses poses = run(pipeline, scan, 0);
+  double error = 0.;
+  for (std::size_t i = 0; i < poses.truth.size(); ++i)
+    error += ((poses.estimated[i] * Eigen::Vector3d::Zero()) - (poses.truth[i] * Eigen::Vector3d::Zero())).norm() /
+             static_cast<double>(poses.truth.size());
+  // The template is the head itself: what is left is the match of coarse volumes, about half of a 3 mm voxel.
+  EXPECT_LT(error, 2.);
+  EXPECT_GE(pipeline.estimate().frame_revision, 1U);
+}
+
+TEST(RegistrationEstimator, PosesDoNotDependOnWhenVolumesAreMade) {
+  const Scan scan = moving_scan(2);
+  LivePipeline never(quick_options()), often(quick_options());
+  const Poses a = run(never, scan, 0), b = run(often, scan, 3);
+  ASSERT_EQ(a.estimated.size(), b.estimated.size());
+  for (std::size_t i = 0; i < a.estimated.size(); ++i)
+    EXPECT_EQ(a.estimated[i].matrix(), b.estimated[i].matrix()) << "slice " << i;
+  EXPECT_EQ(never.volume().values, often.volume().values);
+}
+
+TEST(RegistrationEstimator, TheFrameIsHeldWhileSlicesArrive) {
+  // Slices that are there hold the frame: from one revision to the next they move by the correction of their own poses,
+  // not together.
+  const Scan scan = moving_scan(2);
+  LivePipeline pipeline(quick_options());
+  std::vector<Pose> before;
+  std::uint64_t frame = 0;
+  for (const Slice& slice : scan.slices) {
+    if (!is_kept(pipeline.add(slice).status)) continue;
+    std::vector<Pose> after;
+    for (const SliceEstimate& each : pipeline.estimate().slices) after.push_back(each.T_brain_slice);
+    if (!before.empty() && frame == pipeline.estimate().frame_revision) {
+      Eigen::Vector3d mean = Eigen::Vector3d::Zero();
+      for (std::size_t i = 0; i < before.size(); ++i)
+        mean += (after[i].translation() - before[i].translation()) / static_cast<double>(before.size());
+      EXPECT_LT(mean.norm(), 1.) << after.size() << " slices";
+    }
+    before = after;
+    frame = pipeline.estimate().frame_revision;
+  }
+}
+
+TEST(RegistrationEstimator, StartsAnewAfterReset) {
+  const Scan scan = moving_scan(1);
+  LivePipeline pipeline(quick_options());
+  const Poses first = run(pipeline, scan, 0);
+  const std::uint64_t revision = pipeline.estimate().revision;
+  pipeline.reset();
+  const Poses second = run(pipeline, scan, 0);
+  EXPECT_GT(pipeline.estimate().revision, revision);
+  ASSERT_EQ(first.estimated.size(), second.estimated.size());
+  for (std::size_t i = 0; i < first.estimated.size(); ++i)
+    EXPECT_EQ(first.estimated[i].matrix(), second.estimated[i].matrix());
+}
+
+TEST(RegistrationEstimator, NamesTheOptionThatIsOutOfRange) {
+  PipelineOptions options = quick_options();
+  options.estimator.registration.lever_mm = -1.;
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+  options = quick_options();
+  options.estimator.template_match.refined = 0;
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+}
+
+}  // namespace
+}  // namespace svort
