@@ -65,7 +65,7 @@ if(SVORT_WITH_ROS)
   install(DIRECTORY include/svort_ros/io include/svort_ros/ros DESTINATION ${svort_include_dir}/svort_ros
     FILES_MATCHING PATTERN "*.h")
   install(FILES nodelet_plugins.xml DESTINATION ${svort_share_dir})
-  install(DIRECTORY launch config DESTINATION ${svort_share_dir})
+  install(DIRECTORY launch config models DESTINATION ${svort_share_dir})
   install(DIRECTORY data/real DESTINATION ${svort_share_dir}/data)
 endif()
 
