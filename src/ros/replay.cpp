@@ -218,8 +218,8 @@ int run_svort_replay(int argc, char** argv) {
       throw std::invalid_argument("--masks goes with --stacks; a bag holds its masks itself");
     if (weights->count() + name->count() > 0) options.server.pipeline.estimator.method = "network";
     const svort::EstimatorOptions& estimator = options.server.pipeline.estimator;
-    if (estimator.method == "nominal" && estimator.network.device == "cuda")
-      throw std::invalid_argument("--device cuda: estimator 'nominal' runs on the CPU only");
+    if (estimator.method != "network" && estimator.network.device == "cuda")
+      throw std::invalid_argument("--device cuda: estimator '" + estimator.method + "' runs on the CPU only");
     const ReplaySummary summary = replay(options);
     std::printf("%zu slices: %zu kept, %zu rejected; %.1f s", summary.arrivals, summary.kept,
                 summary.arrivals - summary.kept, summary.wall_s);

@@ -117,12 +117,15 @@ TEST(Simulate, CanBeReplayedAndScored) {
   options.simulator.motion = "none";
   options.simulator.artifacts = svort::no_artifacts();
   std::vector<std::string> replay = simulate(options);
-  for (const char* word : {"--estimator.volume_resolution_mm", "4", "--threads", "1"}) replay.emplace_back(word);
+  for (const char* word : {"--estimator.method", "nominal", "--estimator.volume_resolution_mm", "4", "--threads", "1"})
+    replay.emplace_back(word);
   std::vector<std::string> from_bag{"svort_replay",
                                     "--bag",
                                     (folder.path() / "scan/scan.bag").string(),
                                     "--output",
                                     (folder.path() / "bag").string(),
+                                    "--estimator.method",
+                                    "nominal",
                                     "--estimator.volume_resolution_mm",
                                     "4",
                                     "--threads",
