@@ -21,5 +21,7 @@ catkin_make -C "$workspace" --build "$catkin_build" --use-ninja -j "$(build_jobs
 source_setup "$catkin_build/devel/setup.bash"
 [[ "$(readlink -f "$(rospack find svort_ros)")" == "$(readlink -f "$source_dir")" ]] ||
   fail "rospack finds $(rospack find svort_ros)"
-"$catkin_build/devel/lib/svort_ros/svort_replay" --help | grep -q -- --output ||
+# Read to its end: grep -q would leave, and a program that writes to a closed pipe fails.
+help=$("$catkin_build/devel/lib/svort_ros/svort_replay" --help)
+grep -q -- --output <<<"$help" ||
   fail "svort_replay --help does not mention --output"
