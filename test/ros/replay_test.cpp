@@ -223,7 +223,7 @@ TEST(Replay, BadInputEndsWithCodeTwoAndAMessage) {
   expect_error({"--bag", bag, "--output", out, "--config", out + "/no.yaml"}, "no.yaml: cannot be read");
   expect_error({"--bag", bag, "--output", out, "--device", "cuda"}, "runs on the CPU only");
   expect_error({"--bag", bag, "--output", out, "--device", "tpu"}, "--device");
-  expect_error({"--bag", bag, "--output", out, "--weights", "w.pt"}, "--weights");
+  expect_error({"--bag", bag, "--output", out, "--weights", "w.pt"}, "w.pt: cannot be read");
   expect_error({"--bag", bag, "--output", out, "--threads", "-2"}, "threads");
   expect_error({"--bag", bag, "--output", out, "--realtime", "-1"}, "realtime");
   expect_error({"--bag", bag, "--output", out, "--estimator.method", "magic"}, "estimator.method is 'magic'");
