@@ -113,11 +113,12 @@ void RegistrationEstimator::add(const SliceSequence& sequence) {
   }
   if (slices.size() >= kFewestSlices) {
     const std::vector<Pose> start = crop_poses(sequence);
-    take(sequence, refine_poses(input_of(sequence), start, options_.registration, RefinementEffort::warm), start);
+    const RegistrationInput input = input_of(sequence);
+    take(sequence, refine_poses(input, start, options_.registration, RefinementEffort::warm), start);
     const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
     if (slices.size() >= kFewestForTemplate &&
         (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches)))
-      align_to_template(sequence);
+      align_to_template(sequence, input);
   }
   estimate_.scan_id = sequence.scan_id();
   estimate_.final = false;
@@ -150,7 +151,7 @@ void RegistrationEstimator::move_frame(const Pose& T_new_old) {
   ++estimate_.frame_revision;
 }
 
-void RegistrationEstimator::align_to_template(const SliceSequence& sequence) {
+void RegistrationEstimator::align_to_template(const SliceSequence& sequence, const RegistrationInput& input) {
   aligned_count_ = estimate_.slices.size();
   if (templates_.empty()) return;
   const double voxel = options_.template_match.voxel_mm;
@@ -159,8 +160,7 @@ void RegistrationEstimator::align_to_template(const SliceSequence& sequence) {
   rough.grid.spacing.setConstant(voxel);
   std::vector<double> weights;
   for (const SliceEstimate& slice : estimate_.slices) weights.push_back(slice.weight);
-  const torch::Tensor volume =
-      reconstruct_weighted(input_of(sequence), crop_poses(sequence), weights, rough.grid.size.x(), voxel);
+  const torch::Tensor volume = reconstruct_weighted(input, crop_poses(sequence), weights, rough.grid.size.x(), voxel);
   rough.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
   const double brain = brain_volume_mm3(rough);
   if (!(brain > 0.)) return;
@@ -190,7 +190,7 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
     const Refinement from_nominal = refine_poses(input, nominal, options_.registration);
     take(sequence, from_current.report.last_cost <= from_nominal.report.last_cost ? from_current : from_nominal,
          current);
-    align_to_template(sequence);
+    align_to_template(sequence, input);
   }
   volume_ = estimate_volume(sequence, grid_, formulation_, options_.final_cg_iterations, &estimate_.slices);
   estimate_.final = true;

@@ -12,9 +12,8 @@
 
 #include "../acquisition/parallel.h"
 #include "registration_level.h"
-#include "svort_ros/acquisition/point_spread_function.h"
+#include "svort_ros/acquisition/geometry_of_poses.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
-#include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
 #include "trajectory.h"
 
@@ -24,33 +23,10 @@ namespace {
 constexpr double kFwhmPerSigma = 2.354820045;
 constexpr double kInPlaneFwhm = 1.2;  // pixels (paper, sec. 2)
 
-AcquisitionGeometry geometry_of(const std::vector<Pose>& poses, const std::vector<double>& thickness_mm,
-                                double pixel_mm, double voxel_mm) {
-  AcquisitionGeometry geometry;
-  const auto n = static_cast<std::int64_t>(poses.size());
-  geometry.transforms = torch::empty({n, 3, 4}, torch::kFloat32);
-  geometry.psf_of_slice = torch::empty({n}, torch::kInt64);
-  geometry.resolution_ratio = pixel_mm / voxel_mm;
-  std::map<double, std::int64_t> psf_of_thickness;
-  std::vector<torch::Tensor> psfs;
-  for (std::int64_t i = 0; i < n; ++i) {
-    const double thickness = thickness_mm[static_cast<std::size_t>(i)];
-    const auto [psf, is_new] = psf_of_thickness.try_emplace(thickness, static_cast<std::int64_t>(psfs.size()));
-    if (is_new)
-      psfs.push_back(gaussian_psf({geometry.resolution_ratio, geometry.resolution_ratio, thickness / voxel_mm}));
-    geometry.psf_of_slice.data_ptr<std::int64_t>()[i] = psf->second;
-    Pose pose = poses[static_cast<std::size_t>(i)];
-    pose.translation() /= voxel_mm;
-    geometry.transforms[i].copy_(tensor_from_pose(pose).squeeze(0));
-  }
-  geometry.psf = stack_psfs(psfs);
-  return geometry;
-}
-
 SliceAcquisition acquisition_of(const torch::Tensor& slices, const torch::Tensor& masks, const std::vector<Pose>& poses,
                                 const std::vector<double>& thickness_mm, double pixel_mm, std::int64_t size,
                                 double voxel_mm) {
-  return SliceAcquisition(geometry_of(poses, thickness_mm, pixel_mm, voxel_mm), static_cast<int>(slices.size(2)),
+  return SliceAcquisition(geometry_of_poses(poses, thickness_mm, pixel_mm, voxel_mm), static_cast<int>(slices.size(2)),
                           static_cast<int>(slices.size(3)), {size, size, size}, AcquisitionFormulation::fast,
                           {masks, {}});
 }

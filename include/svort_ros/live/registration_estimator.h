@@ -36,7 +36,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   RegistrationInput input_of(const SliceSequence& sequence) const;
   std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
   void take(const SliceSequence& sequence, const Refinement& refinement, const std::vector<Pose>& before);
-  void align_to_template(const SliceSequence& sequence);
+  void align_to_template(const SliceSequence& sequence, const RegistrationInput& input);
   void move_frame(const Pose& T_new_old);
 
   EstimatorOptions options_;
