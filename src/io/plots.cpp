@@ -42,11 +42,13 @@ std::string ascii(std::string text, std::size_t longest) {
   return text.size() <= longest ? text : text.substr(0, longest - 3) + "...";
 }
 
-void write_png(const std::filesystem::path& path, const cv::Mat& image) {
+std::string encode_png(const cv::Mat& image) {
   std::vector<unsigned char> png;
-  if (!cv::imencode(".png", image, png)) throw std::runtime_error(path.string() + ": cannot encode the picture");
-  write_file(path, std::string(png.begin(), png.end()));
+  if (!cv::imencode(".png", image, png)) throw std::runtime_error("cannot encode the picture");
+  return {png.begin(), png.end()};
 }
+
+void write_png(const std::filesystem::path& path, const cv::Mat& image) { write_file(path, encode_png(image)); }
 
 // ---- volume ---------------------------------------------------------------------------------------------------------
 
@@ -388,6 +390,11 @@ std::string number_label(double value) {
 
 void plot_curves(const std::filesystem::path& path, const std::string& title, const std::string& x_label,
                  const std::string& y_label, const std::vector<Curve>& curves) {
+  write_file(path, curves_png(title, x_label, y_label, curves));
+}
+
+std::string curves_png(const std::string& title, const std::string& x_label, const std::string& y_label,
+                       const std::vector<Curve>& curves) {
   std::vector<double> heights;
   double x_end = 0.;
   for (const Curve& curve : curves) {
@@ -442,7 +449,7 @@ void plot_curves(const std::filesystem::path& path, const std::string& title, co
     int baseline = 0;
     legend += 38 + cv::getTextSize(name, cv::FONT_HERSHEY_SIMPLEX, 0.52, 1, &baseline).width + 34;
   }
-  write_png(path, image);
+  return encode_png(image);
 }
 
 }  // namespace svort

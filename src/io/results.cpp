@@ -11,9 +11,11 @@
 #include <stdexcept>
 
 #include "svort_ros/io/atomic_file.h"
+#include "svort_ros/io/decision_files.h"
 #include "svort_ros/io/nifti.h"
 #include "svort_ros/io/options_file.h"
 #include "svort_ros/io/plots.h"
+#include "svort_ros/io/report.h"
 #include "svort_ros/io/tables.h"
 
 namespace svort {
@@ -48,13 +50,16 @@ Json ncc_to_json(std::vector<double> values) {
 Json latency_to_json(const Journal& journal) {
   std::vector<double> pose;
   std::vector<double> volume;
+  std::vector<double> decision;
   std::vector<double> rejected;
   for (const JournalEntry& entry : journal.entries()) {
     (is_kept(entry.status) ? pose : rejected).push_back(entry.latency_ms);
     if (is_kept(entry.status)) volume.push_back(entry.volume_latency_ms);
+    if (is_kept(entry.status)) decision.push_back(entry.decision_latency_ms);
   }
   return Json{{"pose_ms", percentiles_to_json(pose)},
               {"volume_ms", percentiles_to_json(volume)},
+              {"decision_ms", percentiles_to_json(decision)},
               {"rejected_ms", percentiles_to_json(rejected)}};
 }
 
@@ -73,7 +78,7 @@ Json quality_to_json(const Estimate& estimate) {
   return json;
 }
 
-std::string run_json(const LivePipeline& pipeline, const RunInfo& run) {
+std::string run_json(const LivePipeline& pipeline, const RunInfo& run, const DecisionEngine* decisions) {
   const SliceSequence& sequence = pipeline.sequence();
   Json arrivals = Json::object();
   for (const auto& [status, count] : sequence.arrivals()) arrivals[to_string(status)] = count;
@@ -113,6 +118,10 @@ std::string run_json(const LivePipeline& pipeline, const RunInfo& run) {
   json["wall_s"] = rounded(run.wall_s);
   json["peak_memory_mib"] = rounded(peak_memory_mib());
   json["options"] = options_to_json(pipeline.options());
+  if (decisions) {
+    json["options"]["decision"] = options_to_json(decisions->options());
+    json["decisions"] = decisions_to_json(*decisions);
+  }
   // A scan id may hold any bytes; what is not UTF-8 is replaced instead of losing the file.
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
 }
@@ -135,7 +144,8 @@ double peak_memory_mib() {
   return static_cast<double>(usage.ru_maxrss) / 1024.;
 }
 
-void write_results(const std::filesystem::path& directory, const LivePipeline& pipeline, const RunInfo& run) {
+void write_results(const std::filesystem::path& directory, const LivePipeline& pipeline, const RunInfo& run,
+                   const DecisionEngine* decisions) {
   std::error_code error;
   std::filesystem::create_directories(directory, error);
   if (error || !std::filesystem::is_directory(directory))
@@ -165,7 +175,10 @@ void write_results(const std::filesystem::path& directory, const LivePipeline& p
                           pipeline.options().estimator.method + " poses");
   });
   write_or_remove("latency.png", has_slices, [&](const auto& path) { plot_latency(path, pipeline.journal()); });
-  write_or_remove("run.json", true, [&](const auto& path) { write_file(path, run_json(pipeline, run)); });
+  if (decisions) write_decisions(directory, pipeline.sequence().scan_id(), *decisions);
+  write_or_remove("report.html", decisions && has_slices,
+                  [&](const auto&) { write_report(directory, pipeline, run, *decisions); });
+  write_or_remove("run.json", true, [&](const auto& path) { write_file(path, run_json(pipeline, run, decisions)); });
 }
 
 }  // namespace svort

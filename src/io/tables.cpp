@@ -12,6 +12,7 @@
 #include <string_view>
 #include <utility>
 
+#include "csv_text.h"
 #include "svort_ros/io/atomic_file.h"
 
 namespace svort {
@@ -26,112 +27,7 @@ constexpr std::size_t kEstimateColumns = 21;      // the others are flags of tru
 
 constexpr const char* kUpdateHeader =
     "stamp,stack,slice,sequence_length,revision,latency_ms,encoded,device,tx,ty,tz,qx,qy,qz,qw,status,reason,"
-    "volume_latency_ms";
-
-/// Shortest text that reads back as the same number; "nan" whatever the NaN's sign.
-std::string number(double value) {
-  if (std::isnan(value)) return "nan";
-  std::array<char, 32> buffer{};
-  const auto result = std::to_chars(buffer.data(), buffer.data() + buffer.size(), value);
-  return std::string(buffer.data(), result.ptr);
-}
-
-std::string milliseconds(double value) {
-  if (std::isnan(value)) return "nan";
-  std::array<char, 64> buffer{};
-  std::snprintf(buffer.data(), buffer.size(), "%.3f", value);
-  return buffer.data();
-}
-
-/// Seconds with nine decimals, exact.
-std::string seconds(std::int64_t ns) {
-  constexpr std::int64_t kSecond = 1000000000;
-  std::array<char, 64> buffer{};
-  std::snprintf(buffer.data(), buffer.size(), "%s%lld.%09lld", ns < 0 ? "-" : "",
-                static_cast<long long>(std::abs(ns / kSecond)), static_cast<long long>(std::abs(ns % kSecond)));
-  return buffer.data();
-}
-
-/// Text as a CSV field: quoted if it must be (RFC 4180).
-std::string field(const std::string& text) {
-  if (text.find_first_of(",\"\r\n") == std::string::npos) return text;
-  std::string quoted = "\"";
-  for (const char c : text) {
-    if (c == '"') quoted += '"';
-    quoted += c;
-  }
-  return quoted + '"';
-}
-
-/// "tx,ty,tz,qx,qy,qz,qw", the quaternion with qw >= 0.
-std::string pose_fields(const Pose& pose) {
-  Eigen::Quaterniond q(pose.linear());
-  q.normalize();
-  if (q.w() < 0.) q.coeffs() *= -1.;
-  const auto& t = pose.translation();
-  std::string text;
-  for (const double value : {t.x(), t.y(), t.z(), q.x(), q.y(), q.z(), q.w()})
-    text += (text.empty() ? "" : ",") + number(value == 0. ? 0. : value);  // no "-0"
-  return text;
-}
-
-[[noreturn]] void fail(const std::filesystem::path& path, std::size_t line, const std::string& what) {
-  throw std::runtime_error(path.string() + ", line " + std::to_string(line) + ": " + what);
-}
-
-struct Record {
-  std::size_t line = 0;  ///< line on which it starts, from 1
-  std::vector<std::string> fields;
-};
-
-/// Splits CSV text into records; quoted fields may hold commas, quotes and line breaks. Empty lines are skipped.
-std::vector<Record> parse_csv(const std::filesystem::path& path, const std::string& text) {
-  std::vector<Record> records;
-  Record record;
-  std::string current;
-  bool quoted = false;      // inside quotes
-  bool was_quoted = false;  // the field had quotes, so it may be empty on an otherwise empty line
-  std::size_t line = 1;
-  record.line = 1;
-  const auto end_record = [&] {
-    if (!record.fields.empty() || !current.empty() || was_quoted) {
-      record.fields.push_back(current);
-      records.push_back(record);
-    }
-    record = Record{line, {}};
-    current.clear();
-    was_quoted = false;
-  };
-  for (std::size_t i = 0; i < text.size(); ++i) {
-    const char c = text[i];
-    if (c == '\n') ++line;
-    if (quoted) {
-      if (c != '"') {
-        current += c;
-      } else if (i + 1 < text.size() && text[i + 1] == '"') {
-        current += '"';
-        ++i;
-      } else {
-        quoted = false;
-      }
-    } else if (c == '"') {
-      if (!current.empty()) fail(path, line, "a quote in the middle of a field");
-      quoted = true;
-      was_quoted = true;
-    } else if (c == ',') {
-      record.fields.push_back(current);
-      current.clear();
-      was_quoted = false;
-    } else if (c == '\n') {
-      end_record();
-    } else if (c != '\r') {
-      current += c;
-    }
-  }
-  if (quoted) fail(path, record.line, "a quoted field does not end");
-  end_record();
-  return records;
-}
+    "volume_latency_ms,decision_latency_ms";
 
 /// One line of the table, with its fields by the name of their column.
 class RowReader {
@@ -295,7 +191,7 @@ void write_update_table(const std::filesystem::path& path, const Journal& journa
         << entry.encoded << ',' << field(entry.device) << ','
         << (is_kept(entry.status) ? pose_fields(entry.T_brain_slice) : std::string("nan,nan,nan,nan,nan,nan,nan"))
         << ',' << to_string(entry.status) << ',' << field(entry.reason) << ',' << milliseconds(entry.volume_latency_ms)
-        << '\n';
+        << ',' << milliseconds(entry.decision_latency_ms) << '\n';
   write_file(path, csv.str());
 }
 

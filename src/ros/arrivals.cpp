@@ -93,7 +93,8 @@ std::vector<AwaitingVolume::Published> AwaitingVolume::volume_published(svort::L
     pipeline.journal().set_volume_latency(item.entry, latency_ms);
     const svort::JournalEntry& entry = pipeline.journal().entries().at(item.entry);
     if (const svort::SliceEstimate* slice = find_slice(pipeline.estimate(), entry.info))
-      published.push_back({latency_ms, progress_line(item.head, entry, pipeline.estimate().slices.front(), *slice)});
+      published.push_back(
+          {item, latency_ms, progress_line(item.head, entry, pipeline.estimate().slices.front(), *slice)});
   }
   items_.clear();
   return published;

@@ -142,6 +142,7 @@ ServerOptions load_parameters(const ros::NodeHandle& private_nh) {
   ParameterReader reader = read_parameters(private_nh);
   options.visit(reader);  // beside the sections, the namespace may hold other people's parameters
   validate(options.node);
+  validate(options.decision);
   return options;
 }
 

@@ -7,11 +7,14 @@
 #include <cstdio>
 #include <exception>
 #include <map>
+#include <memory>
 #include <set>
 #include <stdexcept>
 #include <thread>
 
+#include "svort_ros/decision/decision_engine.h"
 #include "svort_ros/io/brain_templates.h"
+#include "svort_ros/io/decision_files.h"
 #include "svort_ros/io/options_file.h"
 #include "svort_ros/io/results.h"
 #include "svort_ros/live/live_pipeline.h"
@@ -81,6 +84,16 @@ Clock::time_point wait_for(const Slice& message, const Slice& first, Clock::time
   return due;
 }
 
+/// What a file for --what-if may hold.
+struct WhatIfOptions {
+  svort::DecisionOptions decision;
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v.section("decision", decision);
+  }
+};
+
 }  // namespace
 
 ReplaySummary replay(const ReplayOptions& options) {
@@ -90,6 +103,17 @@ ReplaySummary replay(const ReplayOptions& options) {
   svort::set_thread_count(options.server.node.threads);
   svort::LivePipeline pipeline(options.server.pipeline,
                                svort::load_templates(options.server.pipeline.estimator.templates));
+  svort::DecisionEngine decisions(options.server.decision);
+  std::unique_ptr<svort::DecisionEngine> what_if;  // the same scan under other thresholds
+  if (!options.what_if.empty()) {
+    WhatIfOptions other{options.server.decision};  // what the file does not name is as it is
+    svort::load_options(options.what_if, other);
+    what_if = std::make_unique<svort::DecisionEngine>(other.decision);
+  }
+  const auto decide = [&](const svort::LivePipeline& scan) {
+    decisions.update(scan);
+    if (what_if) what_if->update(scan);
+  };
   const std::vector<Slice> messages =
       options.bag.empty() ? read_messages(options.input) : read_slices(options.bag, options.topic);
 
@@ -108,7 +132,11 @@ ReplaySummary replay(const ReplayOptions& options) {
     run.threads = svort::thread_count();
     run.wall_s = milliseconds_since(scan_started) / 1000.;
     summary.folders.push_back(folders.next(scan.sequence().scan_id()));
-    svort::write_results(summary.folders.back(), scan, run);
+    decide(scan);
+    svort::write_results(summary.folders.back(), scan, run, &decisions);
+    if (what_if) svort::write_what_if(summary.folders.back(), scan.sequence().scan_id(), decisions, *what_if);
+    decisions.clear();
+    if (what_if) what_if->clear();
   };
   pipeline.set_scan_end_callback([&](const svort::LivePipeline& scan) {
     write(scan);
@@ -136,8 +164,12 @@ ReplaySummary replay(const ReplayOptions& options) {
       ++summary.kept;
       awaiting_volume.add({number, arrived, head});
       pipeline.update_volume();
-      for (const auto& published : awaiting_volume.volume_published(pipeline))
+      const auto volume_published = awaiting_volume.volume_published(pipeline);
+      decide(pipeline);
+      for (const auto& published : volume_published) {
+        pipeline.journal().set_decision_latency(published.slice.entry, milliseconds_since(published.slice.arrived));
         display.show(summary.arrivals, published.line);
+      }
     }
   }
   pipeline.finalise();
@@ -210,7 +242,10 @@ int run_svort_replay(int argc, char** argv) {
   app.add_option("--realtime", options.realtime, "1: the scanner's pace, 2: twice as fast, 0: as fast as possible")
       ->capture_default_str();
   app.add_option("--seed", options.seed, "seed of random numbers; kept in run.json")->capture_default_str();
+  app.add_option("--what-if", options.what_if,
+                 "YAML file with other thresholds (section decision); what they would decide goes to OUTPUT/what_if");
   svort::bind_options(app, options.server.pipeline);
+  options.server.decision.visit(svort::options_detail::CommandLineBinder(app, "Options: decision", "decision."));
   return run_program(app, argc, argv, [&] {
     if (options.bag.empty() == options.input.stacks.empty())
       throw std::invalid_argument("give either --bag or --stacks");

@@ -36,13 +36,15 @@ std::string folder_name(const std::string& scan_id) {
   return name;
 }
 
-std::filesystem::path ScanArchive::save(const svort::LivePipeline& pipeline, const svort::RunInfo& run) {
-  write(pipeline, run, &folder_);
+std::filesystem::path ScanArchive::save(const svort::LivePipeline& pipeline, const svort::RunInfo& run,
+                                        const svort::DecisionEngine* decisions) {
+  write(pipeline, run, decisions, &folder_);
   return folder_;
 }
 
-void ScanArchive::keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run) {
-  kept_.push_back({std::move(pipeline), std::move(run), std::exchange(folder_, {})});
+void ScanArchive::keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run,
+                       std::unique_ptr<svort::DecisionEngine> decisions) {
+  kept_.push_back({std::move(pipeline), std::move(decisions), std::move(run), std::exchange(folder_, {})});
 }
 
 ScanArchive::Retry ScanArchive::retry() {
@@ -50,7 +52,7 @@ ScanArchive::Retry ScanArchive::retry() {
   std::vector<Kept> left;
   for (Kept& scan : kept_) {
     try {
-      write(*scan.pipeline, scan.run, &scan.folder);
+      write(*scan.pipeline, scan.run, scan.decisions.get(), &scan.folder);
       result.written.push_back(scan.folder);
     } catch (const std::exception& error) {
       result.failures.emplace_back(error.what());
@@ -62,11 +64,11 @@ ScanArchive::Retry ScanArchive::retry() {
 }
 
 void ScanArchive::write(const svort::LivePipeline& pipeline, const svort::RunInfo& run,
-                        std::filesystem::path* folder) const {
+                        const svort::DecisionEngine* decisions, std::filesystem::path* folder) const {
   if (!enabled())
     throw std::runtime_error("parameter ~node/output_directory is not set, so there is no place to write");
   if (folder->empty()) *folder = make_new_folder(root_, folder_name(pipeline.sequence().scan_id()));
-  svort::write_results(*folder, pipeline, run);
+  svort::write_results(*folder, pipeline, run, decisions);
 }
 
 }  // namespace svort_ros

@@ -13,10 +13,12 @@
 
 #include "svort_ros/io/atomic_file.h"
 #include "svort_ros/io/brain_volume_file.h"
+#include "svort_ros/io/closed_loop.h"
 #include "svort_ros/io/nifti.h"
 #include "svort_ros/io/options_file.h"
 #include "svort_ros/io/simulation_plot.h"
 #include "svort_ros/io/tables.h"
+#include "svort_ros/live/threads.h"
 #include "svort_ros/ros/bag.h"
 #include "svort_ros/ros/conversions.h"
 #include "svort_ros/ros/names.h"
@@ -217,6 +219,55 @@ std::vector<std::string> simulate(const SimulateOptions& options) {
   return replay;
 }
 
+namespace {
+
+struct ClosedLoopCommand {
+  std::vector<std::string> motions = {"mild", "moderate", "severe"};
+  std::vector<std::string> strategies = {"none", "whole_stacks", "end_of_stack", "requests"};
+  int seeds = 10;
+  int threads = 1;
+  svort::ClosedLoopOptions options;
+};
+
+/// Every motion class, seed and strategy; the table so far is on the disk after each scan.
+void run_closed_loops(const SimulateOptions& simulation, const ClosedLoopCommand& command) {
+  using svort::RepeatStrategy;
+  std::vector<RepeatStrategy> strategies;
+  for (const std::string& name : command.strategies) {
+    const auto known = {RepeatStrategy::none, RepeatStrategy::whole_stacks, RepeatStrategy::end_of_stack,
+                        RepeatStrategy::requests};
+    const auto* found =
+        std::find_if(known.begin(), known.end(), [&](RepeatStrategy each) { return name == svort::to_string(each); });
+    if (found == known.end())
+      throw std::invalid_argument("--strategies: '" + name +
+                                  "' is unknown; there are none, whole_stacks, end_of_stack and requests");
+    strategies.push_back(*found);
+  }
+  if (command.seeds < 1) throw std::invalid_argument("--seeds must be at least 1");
+  for (const std::string& motion : command.motions) svort::motion_class(motion);  // throws if unknown
+  svort::set_thread_count(command.threads);
+  const std::vector<svort::BrainVolume> brains = brain_volumes(simulation);
+  fs::create_directories(simulation.output);
+  std::vector<svort::ClosedLoopResult> results;
+  for (int i = 0; i < command.seeds; ++i)
+    for (const std::string& motion : command.motions)
+      for (const RepeatStrategy strategy : strategies) {
+        const std::uint64_t seed = simulation.seed + static_cast<std::uint64_t>(i);
+        results.push_back(svort::run_closed_loop(brains[static_cast<std::size_t>(i) % brains.size()], motion, seed,
+                                                 strategy, command.options));
+        const svort::ClosedLoopResult& r = results.back();
+        std::fprintf(stderr, "%-8s seed %2llu %-12s scan %4.0f s, %3d repeats, volume error %.3f, poses %.2f mm\n",
+                     motion.c_str(), static_cast<unsigned long long>(seed), svort::to_string(strategy), r.scan_s,
+                     r.repeats, r.volume_error, r.pose_error_mm);
+        svort::write_file(fs::path(simulation.output) / "closed_loop.csv", svort::to_csv(results));
+      }
+  const std::string table = svort::to_markdown(results);
+  svort::write_file(fs::path(simulation.output) / "closed_loop.md", table);
+  std::fputs(table.c_str(), stdout);
+}
+
+}  // namespace
+
 int run_svort_simulate(int argc, char** argv) {
   CLI::App app(
       "Simulates a scan of a moving fetal brain, with its truth: stacks and masks (NIfTI), a bag, truth.csv, a "
@@ -236,6 +287,27 @@ int run_svort_simulate(int argc, char** argv) {
   auto* save = app.add_option("--save-volumes", bank,
                               "only write the volumes into this one file, for machines without a NIfTI library");
   output->excludes(save);
+  ClosedLoopCommand loops;
+  bool closed_loop = false;
+  const char* const kLoop = "Closed loop";
+  auto* loop_flag = app.add_flag("--closed-loop", closed_loop,
+                                 "scans in which the scanner obeys the requests, against other ways to repeat slices")
+                        ->group(kLoop)
+                        ->excludes(save);
+  app.add_option("--seeds", loops.seeds, "scans per motion class and strategy, from --seed on")
+      ->group(kLoop)
+      ->needs(loop_flag)
+      ->capture_default_str();
+  app.add_option("--motions", loops.motions, "motion classes")->group(kLoop)->needs(loop_flag)->capture_default_str();
+  app.add_option("--strategies", loops.strategies, "none, whole_stacks, end_of_stack, requests")
+      ->group(kLoop)
+      ->needs(loop_flag)
+      ->capture_default_str();
+  app.add_option("--threads", loops.threads, "threads of the estimator; 0 takes all cores")
+      ->group(kLoop)
+      ->needs(loop_flag)
+      ->capture_default_str();
+  loops.options.decision.visit(svort::options_detail::CommandLineBinder(app, "Closed loop: decision", "decision."));
   svort::bind_options(app, options.simulator);
   options.phantom.visit(svort::options_detail::CommandLineBinder(app, "Options: phantom", "phantom."));
   try {
@@ -246,6 +318,10 @@ int run_svort_simulate(int argc, char** argv) {
       const auto volumes = brain_volumes(options);
       svort::save_brain_volumes(bank, volumes);
       std::printf("%zu volumes in %s\n", volumes.size(), bank.c_str());
+      return 0;
+    }
+    if (closed_loop) {
+      run_closed_loops(options, loops);
       return 0;
     }
     const std::vector<std::string> replay = simulate(options);

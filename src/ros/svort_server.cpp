@@ -15,15 +15,19 @@
 #include <thread>
 #include <utility>
 
+#include "svort_ros/Veto.h"
+#include "svort_ros/decision/decision_engine.h"
 #include "svort_ros/io/brain_templates.h"
 #include "svort_ros/live/threads.h"
 #include "svort_ros/ros/arrivals.h"
 #include "svort_ros/ros/conversions.h"
+#include "svort_ros/ros/decision_publisher.h"
 #include "svort_ros/ros/estimate_publisher.h"
 #include "svort_ros/ros/inbox.h"
 #include "svort_ros/ros/names.h"
 #include "svort_ros/ros/node_health.h"
 #include "svort_ros/ros/parameters.h"
+#include "svort_ros/ros/reconfigure.h"
 #include "svort_ros/ros/scan_archive.h"
 
 namespace svort_ros {
@@ -65,9 +69,11 @@ class SvortServer::Worker {
         topic_(nh.resolveName(kSliceTopic)),
         templates_(svort::load_templates(options.pipeline.estimator.templates)),
         pipeline_(std::make_unique<svort::LivePipeline>(options.pipeline, templates_)),
+        decisions_(std::make_unique<svort::DecisionEngine>(options.decision)),
         archive_(options.node.output_directory),
         status_publisher_(ros::NodeHandle(nh).advertise<SliceStatus>(kSliceStatusTopic, 1000)),
         publisher_(nh, options.node, [this](EstimatePublisher::Product product) { subscribed(product); }),
+        decision_publisher_(nh, options.node, [this] { subscribed_to_decisions(); }),
         health_(nh, private_nh, options.node, [this] { return inbox_.size(); }),
         thread_([this] { run(); }) {}
 
@@ -84,11 +90,14 @@ class SvortServer::Worker {
 
   /// Has the worker execute the command after all that arrived before it, and waits for the answer.
   CommandAnswer call(Command command) {
+    return call(std::function<CommandAnswer()>([this, command] { return (this->*command)(); }));
+  }
+  CommandAnswer call(const std::function<CommandAnswer()>& command) {
     const CommandAnswer stopping{false, "the node is shutting down"};
     const auto promise = std::make_shared<std::promise<CommandAnswer>>();
     std::future<CommandAnswer> answer = promise->get_future();
     const auto execute = [this, command, promise, stopping](bool closed) {
-      promise->set_value(closed ? stopping : guarded(command));
+      promise->set_value(closed ? stopping : guarded_answer(command));
     };
     return inbox_.push({nullptr, Clock::now(), execute}) ? answer.get() : stopping;
   }
@@ -98,6 +107,10 @@ class SvortServer::Worker {
   CommandAnswer reset();
   CommandAnswer save();
   CommandAnswer finalise();
+  CommandAnswer veto(int id, const std::string& reason);
+
+  /// Changes thresholds. @return those in use afterwards: the old ones if something is wrong with the change
+  svort::DecisionOptions reconfigure(const dynamic_reconfigure::Config& change);
 
  private:
   struct Item {
@@ -112,6 +125,12 @@ class SvortServer::Worker {
                  }});
   }
 
+  void subscribed_to_decisions() {
+    inbox_.push({nullptr, Clock::now(), [this](bool closed) {
+                   if (!closed) guarded([&] { decision_publisher_.publish_pictures(*decisions_, *pipeline_); });
+                 }});
+  }
+
   void run();
   void answer(const Slice& message, Clock::time_point arrived);
   svort::Arrival take_in(const SliceFromMessage& decoded);
@@ -119,6 +138,7 @@ class SvortServer::Worker {
   void update_volume();
   void report_estimator();
   void publish_volume();
+  void decide();
   void publish_estimate();
   void save_at_exit();
   svort::RunInfo run_info() const;
@@ -135,9 +155,9 @@ class SvortServer::Worker {
       return false;
     }
   }
-  CommandAnswer guarded(Command command) {
+  CommandAnswer guarded_answer(const std::function<CommandAnswer()>& command) {
     CommandAnswer answer{false, "internal error; the log says more"};
-    guarded([&] { answer = (this->*command)(); });
+    guarded([&] { answer = command(); });
     return answer;
   }
 
@@ -148,6 +168,7 @@ class SvortServer::Worker {
   // The worker's thread alone touches these.
   const std::vector<svort::BrainTemplate> templates_;
   std::unique_ptr<svort::LivePipeline> pipeline_;
+  std::unique_ptr<svort::DecisionEngine> decisions_;  ///< of the same scan
   std::uint64_t revision_offset_ = 0;  ///< of pipelines that were put aside, so that revisions go on counting
   std::set<std::string> ended_scans_;
   ScanArchive archive_;
@@ -160,6 +181,7 @@ class SvortServer::Worker {
 
   ros::Publisher status_publisher_;
   EstimatePublisher publisher_;
+  DecisionPublisher decision_publisher_;
   NodeHealth health_;
   std::thread thread_;  ///< last: it uses all of the above
 };
@@ -264,16 +286,17 @@ svort::Arrival SvortServer::Worker::take_in(const SliceFromMessage& decoded) {
 void SvortServer::Worker::end_scan() {
   const std::string scan_id = pipeline_->sequence().scan_id();
   ROS_INFO("scan %s has ended with %zu slices", scan_id.c_str(), pipeline_->sequence().slices().size());
-  guarded(&Worker::finalise);
+  guarded([&] { finalise(); });
+  const svort::DecisionOptions thresholds = decisions_->options();
   if (archive_.enabled()) {
     try {
-      const auto folder = archive_.save(*pipeline_, run_info());
+      const auto folder = archive_.save(*pipeline_, run_info(), decisions_.get());
       health_.write_succeeded(archive_.kept());
       ROS_INFO("scan %s is in %s", scan_id.c_str(), folder.c_str());
     } catch (const std::exception& error) {
       const svort::RunInfo run = run_info();
       revision_offset_ += pipeline_->estimate().revision;
-      archive_.keep(std::move(pipeline_), run);
+      archive_.keep(std::move(pipeline_), run, std::move(decisions_));
       pipeline_ = std::make_unique<svort::LivePipeline>(options_.pipeline, templates_);
       health_.write_failed(error.what(), archive_.kept());
       ROS_ERROR("scan %s could not be written and is kept in memory until ~save succeeds: %s", scan_id.c_str(),
@@ -285,6 +308,7 @@ void SvortServer::Worker::end_scan() {
   ended_scans_.insert(scan_id);
   archive_.begin_scan();
   publisher_.begin_scan();
+  decisions_ = std::make_unique<svort::DecisionEngine>(thresholds);
   progress_.clear();
   awaiting_volume_.clear();
   has_unsaved_ = false;
@@ -301,11 +325,56 @@ void SvortServer::Worker::update_volume() {
 void SvortServer::Worker::publish_volume() {
   publisher_.publish_volume(*pipeline_, revision_offset_);
   publish_estimate();  // with the volume came each slice's ncc
-  for (const AwaitingVolume::Published& slice : awaiting_volume_.volume_published(*pipeline_)) {
+  const std::vector<AwaitingVolume::Published> published = awaiting_volume_.volume_published(*pipeline_);
+  guarded([&] { decide(); });
+  for (const AwaitingVolume::Published& slice : published) {
+    pipeline_->journal().set_decision_latency(slice.slice.entry, milliseconds_since(slice.slice.arrived));
     health_.volume_published(slice.latency_ms);
     ROS_INFO("%s", slice.line.c_str());
   }
   has_unsaved_ = true;
+}
+
+void SvortServer::Worker::decide() {
+  const std::size_t known = decisions_->planner().events().size();
+  if (!decisions_->update(*pipeline_)) return;
+  decision_publisher_.publish(*decisions_, *pipeline_, revision_offset_);
+  const auto& events = decisions_->planner().events();
+  for (std::size_t i = known; i < events.size(); ++i) {
+    const svort::ReacquisitionRequest& request = events[i].request;
+    std::string reasons;
+    for (const std::string& reason : request.reasons) reasons += " " + reason;
+    ROS_INFO("request %d %s: stack %d slice %d%s, gain %.1f %%, %.1f s left", request.id, events[i].event.c_str(),
+             request.stack, request.index, reasons.c_str(), 100. * request.gain, events[i].budget_left_s);
+  }
+}
+
+CommandAnswer SvortServer::Worker::veto(int id, const std::string& reason) {
+  const int count = decisions_->veto(id, reason);
+  if (count == 0) return {false, id == 0 ? "no request waits" : "request " + std::to_string(id) + " does not wait"};
+  has_unsaved_ = true;
+  decision_publisher_.publish(*decisions_, *pipeline_, revision_offset_);
+  const std::string text = std::to_string(count) + (count == 1 ? " request vetoed" : " requests vetoed");
+  ROS_INFO("%s: %s", text.c_str(), reason.c_str());
+  return {true, text};
+}
+
+svort::DecisionOptions SvortServer::Worker::reconfigure(const dynamic_reconfigure::Config& change) {
+  svort::DecisionOptions in_use;
+  call([&]() -> CommandAnswer {
+    in_use = decisions_->options();
+    try {
+      svort::DecisionOptions wanted = in_use;
+      apply_config(change, &wanted);
+      decisions_->set_options(wanted);
+      in_use = wanted;
+      ROS_INFO("thresholds changed: %s", decisions_->planner().events().back().detail.c_str());
+    } catch (const std::invalid_argument& error) {
+      ROS_ERROR("thresholds stay as they are: %s", error.what());
+    }
+    return {true, ""};
+  });
+  return in_use;
 }
 
 void SvortServer::Worker::publish_estimate() {
@@ -340,6 +409,8 @@ CommandAnswer SvortServer::Worker::reset() {
   estimate_is_new_ = false;
   has_unsaved_ = false;
   publisher_.clear(*pipeline_, revision_offset_);
+  decisions_->clear();
+  decision_publisher_.clear(*pipeline_, revision_offset_);
   const std::string text = std::to_string(slices) + " slices forgotten";
   ROS_INFO("reset: %s", text.c_str());
   return {true, text};
@@ -364,7 +435,7 @@ CommandAnswer SvortServer::Worker::save() {
   const std::size_t slices = pipeline_->sequence().slices().size();
   if (slices > 0) {
     try {
-      const auto folder = archive_.save(*pipeline_, run_info());
+      const auto folder = archive_.save(*pipeline_, run_info(), decisions_.get());
       health_.write_succeeded(archive_.kept());
       has_unsaved_ = false;
       add("wrote " + folder.string() + " (" + std::to_string(slices) + " slices, revision " +
@@ -384,7 +455,7 @@ void SvortServer::Worker::save_at_exit() {
   if (scan_in_hand && !archive_.enabled())
     ROS_WARN("the scan in hand is not written: ~node/output_directory is not set");
   else if (scan_in_hand || archive_.kept() > 0)
-    guarded(&Worker::save);
+    guarded([&] { save(); });
 }
 
 svort::RunInfo SvortServer::Worker::run_info() const {
@@ -398,17 +469,29 @@ svort::RunInfo SvortServer::Worker::run_info() const {
 
 class SvortServer::Callbacks {
  public:
-  Callbacks(const ros::NodeHandle& slice_nh, const ros::NodeHandle& service_nh, const NodeOptions& options,
+  Callbacks(const ros::NodeHandle& slice_nh, const ros::NodeHandle& service_nh, const ServerOptions& options,
             Worker* worker)
-      : options_(options), worker_(worker), slice_nh_(slice_nh), service_nh_(service_nh) {
+      : options_(options.node),
+        worker_(worker),
+        slice_nh_(slice_nh),
+        service_nh_(service_nh),
+        thresholds_(ros::NodeHandle(service_nh, kThresholds), options.decision,
+                    [worker](const dynamic_reconfigure::Config& change) { return worker->reconfigure(change); }) {
     subscriber_ = slice_nh_.subscribe<Slice>(
-        kSliceTopic, static_cast<std::uint32_t>(options.queue_size),
+        kSliceTopic, static_cast<std::uint32_t>(options_.queue_size),
         [worker](const Slice::ConstPtr& message) { worker->receive(message); }, ros::VoidConstPtr(),
         ros::TransportHints().tcpNoDelay());
     serve(kResetService, &Worker::reset);
     serve(kSaveService, &Worker::save);
     serve(kFinaliseService, &Worker::finalise);
-    publisher_timer_ = slice_nh_.createTimer(ros::Duration(options.no_slice_warning_s),
+    services_.push_back(service_nh_.advertiseService<Veto::Request, Veto::Response>(
+        kVetoService, [worker](Veto::Request& request, Veto::Response& response) {
+          const CommandAnswer answer = worker->call([&] { return worker->veto(request.id, request.reason); });
+          response.success = static_cast<std::uint8_t>(answer.success);
+          response.message = answer.message;
+          return true;
+        }));
+    publisher_timer_ = slice_nh_.createTimer(ros::Duration(options_.no_slice_warning_s),
                                              [this](const ros::TimerEvent&) { check_publishers(); });
   }
 
@@ -438,6 +521,7 @@ class SvortServer::Callbacks {
   ros::Subscriber subscriber_;
   std::vector<ros::ServiceServer> services_;
   ros::Timer publisher_timer_;
+  ReconfigureServer thresholds_;
   bool warned_ = false;
 };
 
@@ -446,8 +530,8 @@ SvortServer::SvortServer(const ros::NodeHandle& nh, const ros::NodeHandle& priva
   const ServerOptions options = load_parameters(private_nh);
   const ros::NodeHandle slice_nh = CallbackThreads::on(nh, &threads_->slice_queue);
   worker_ = std::make_unique<Worker>(slice_nh, CallbackThreads::on(private_nh, &threads_->slice_queue), options);
-  callbacks_ = std::make_unique<Callbacks>(slice_nh, CallbackThreads::on(private_nh, &threads_->service_queue),
-                                           options.node, worker_.get());
+  callbacks_ = std::make_unique<Callbacks>(slice_nh, CallbackThreads::on(private_nh, &threads_->service_queue), options,
+                                           worker_.get());
   threads_->start();
   ROS_INFO("listening to %s; estimator: %s", nh.resolveName(kSliceTopic).c_str(),
            options.pipeline.estimator.method.c_str());

@@ -148,6 +148,7 @@ TEST_F(Tables, UpdatesAreExactlyAsDescribed) {
   entry.revision = 4;
   entry.latency_ms = 1.23456;
   entry.volume_latency_ms = kNan;
+  entry.decision_latency_ms = 7.5;
   entry.device = "cpu";
   entry.T_brain_slice.translation() << 1., 2., 3.;
   journal.add(entry);
@@ -157,10 +158,10 @@ TEST_F(Tables, UpdatesAreExactlyAsDescribed) {
   write_update_table(path("updates.csv"), journal);
   EXPECT_EQ(read(path("updates.csv")),
             "stamp,stack,slice,sequence_length,revision,latency_ms,encoded,device,tx,ty,tz,qx,qy,qz,qw,status,reason,"
-            "volume_latency_ms\n"
-            "1.200000000,2,5,3,4,1.235,0,cpu,1,2,3,0,0,0,1,accepted,,nan\n"
+            "volume_latency_ms,decision_latency_ms\n"
+            "1.200000000,2,5,3,4,1.235,0,cpu,1,2,3,0,0,0,1,accepted,,nan,7.500\n"
             "1.200000000,2,5,3,4,1.235,0,cpu,nan,nan,nan,nan,nan,nan,nan,bad_image,"
-            "\"pixel is nan, must be \"\"finite\"\"\",nan\n");
+            "\"pixel is nan, must be \"\"finite\"\"\",nan,7.500\n");
 }
 
 TEST_F(Tables, NamesTheFileThatCannotBeWritten) {

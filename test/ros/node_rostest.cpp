@@ -1,6 +1,7 @@
 // svort_node as its users see it; node.test starts it.
 
 #include <diagnostic_msgs/DiagnosticArray.h>
+#include <dynamic_reconfigure/Reconfigure.h>
 #include <geometry_msgs/PoseStamped.h>
 #include <gtest/gtest.h>
 #include <sensor_msgs/PointCloud2.h>
@@ -12,6 +13,10 @@
 #include <limits>
 
 #include "ros/node_client.h"
+#include "svort_ros/Coverage.h"
+#include "svort_ros/HeadMotion.h"
+#include "svort_ros/ReacquisitionPlan.h"
+#include "svort_ros/Veto.h"
 #include "svort_ros/io/tables.h"
 
 namespace svort_ros {
@@ -235,6 +240,65 @@ TEST_F(NodeTest, SaveWritesAndResetForgets) {
   EXPECT_TRUE(client_.call(kSaveService).success);
   EXPECT_TRUE(fs::exists(output_ / "save_me_2" / "poses.csv"));  // the first one is left alone
   EXPECT_EQ(svort::read_pose_table(folder / "poses.csv").size(), 6U);
+}
+
+TEST_F(NodeTest, DecidesAndTakesVetoesAndThresholds) {
+  Collector<ReacquisitionPlan> plans(kReacquisitionTopic);
+  Collector<HeadMotion> motion(kHeadMotionTopic);
+  Collector<Coverage> coverage(kCoverageTopic);
+  Collector<visualization_msgs::MarkerArray> planned(kPlannedSlicesTopic);
+  // Every place in all three stacks, and at once: then the slice that is left out is missed.
+  dynamic_reconfigure::Reconfigure change;
+  for (const auto& [name, value] :
+       {std::pair{"coverage__views", 2.6}, {"coverage__sharp_views", 1.6}, {"reacquisition__budget_s", 500.}}) {
+    dynamic_reconfigure::DoubleParameter parameter;
+    parameter.name = name;
+    parameter.value = value;
+    change.request.config.doubles.push_back(parameter);
+  }
+  dynamic_reconfigure::IntParameter at_once;
+  at_once.name = "reacquisition__confirm_updates";
+  at_once.value = 1;
+  change.request.config.ints.push_back(at_once);
+  ASSERT_TRUE(ros::service::call("svort/decision/set_parameters", change));
+  const auto in_use = [&change](const std::string& name) {
+    for (const auto& parameter : change.response.config.doubles)
+      if (parameter.name == name) return parameter.value;
+    return -1.;
+  };
+  EXPECT_EQ(in_use("reacquisition__budget_s"), 500.);
+  change.request.config.doubles[0].value = -1.;  // out of range: nothing changes
+  ASSERT_TRUE(ros::service::call("svort/decision/set_parameters", change));
+  EXPECT_EQ(in_use("coverage__views"), 2.6);
+
+  for (const Slice& slice : synthetic_messages("decisions"))
+    if (slice.stack != 1 || slice.index != 3) ASSERT_TRUE(client_.send_and_wait(slice).kept);
+  ASSERT_TRUE(client_.call(kFinaliseService).success);
+  ASSERT_TRUE(eventually([&] { return plans.count() > 0 && !plans.all().back().requests.empty(); }));
+  EXPECT_TRUE(plans.all().back().dry_run);
+  EXPECT_EQ(plans.all().back().header.frame_id, "scanner");
+  ASSERT_TRUE(eventually([&] { return coverage.count() > 0 && motion.count() > 0 && planned.count() > 0; }));
+  EXPECT_GT(coverage.all().back().brain_volume, 0.);
+  EXPECT_EQ(int{motion.all().back().motion_class}, int{HeadMotion::NONE});  // nominal poses
+
+  Veto veto;
+  veto.request.id = plans.all().back().requests.front().id;
+  veto.request.reason = "the mother needs a break";
+  ASSERT_TRUE(ros::service::call("svort/veto", veto));
+  EXPECT_TRUE(veto.response.success) << veto.response.message;
+  ASSERT_TRUE(ros::service::call("svort/veto", veto));
+  EXPECT_FALSE(veto.response.success);
+  EXPECT_TRUE(eventually([&] {
+    for (const ReacquisitionRequest& request : plans.all().back().requests)
+      if (request.id == veto.request.id) return false;
+    return true;
+  }));
+
+  ASSERT_TRUE(client_.call(kSaveService).success);
+  const std::string audit = svort_test::read_bytes(output_ / "decisions" / "reacquisition.csv");
+  EXPECT_NE(audit.find("the mother needs a break"), std::string::npos);
+  EXPECT_NE(audit.find("coverage.views 2 -> 2.6"), std::string::npos) << audit;
+  EXPECT_TRUE(fs::exists(output_ / "decisions" / "report.html"));
 }
 
 TEST_F(NodeTest, ANewScanWritesTheOldOne) {

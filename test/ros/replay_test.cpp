@@ -124,13 +124,41 @@ TEST(Replay, GivesTheSameBytesTwice) {
     EXPECT_NE(outcome.out.find("24 slices: 24 kept, 0 rejected"), std::string::npos) << outcome.out;
     EXPECT_NE(outcome.err.find("[ 24/ 24] stack 2 slice  7  accepted"), std::string::npos) << outcome.err;
   }
-  for (const char* file : {"poses.csv", "volume.nii.gz", "volume.png"})
+  for (const char* file : {"poses.csv", "volume.nii.gz", "volume.png", "motion.csv", "quality.csv", "reacquisition.csv",
+                           "decisions.jsonl", "coverage.nii.gz", "orientations.nii.gz"})
     EXPECT_EQ(read_bytes(folder.path() / "a" / file), read_bytes(folder.path() / "b" / file)) << file;
   const auto json = nlohmann::json::parse(read_bytes(folder.path() / "a" / "run.json"));
   EXPECT_EQ(json["seed"], 5);
   EXPECT_EQ(json["threads"], 1);
   EXPECT_EQ(json["options"]["estimator"]["volume_resolution_mm"], 3.);
   EXPECT_EQ(json["final"], true);
+}
+
+TEST(Replay, SaysWhatOtherThresholdsWouldDecide) {
+  const TemporaryFolder folder;
+  const std::string bag = (folder.path() / "scan.bag").string();
+  const std::string thresholds = (folder.path() / "strict.yaml").string();
+  const fs::path output = folder.path() / "out";
+  write_slices(bag, messages(), "slices");
+  std::ofstream(thresholds) << "decision: {quality: {accept: 0.9999}}\n";
+  const auto arguments = coarse(
+      {"--bag", bag, "--output", output.string(), "--what-if", thresholds, "--decision.reacquisition.budget_s", "11"});
+  const Outcome outcome = run(run_svort_replay, arguments);
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  const auto json = nlohmann::json::parse(read_bytes(output / "what_if" / "what_if.json"));
+  EXPECT_EQ(json["decided"]["options"]["quality"]["accept"], svort::SliceQualityOptions().accept);
+  EXPECT_EQ(json["what_if"]["options"]["quality"]["accept"], 0.9999);
+  EXPECT_EQ(json["what_if"]["options"]["reacquisition"]["budget_s"], 11.);  // what the file does not name is as it is
+  EXPECT_GT(json["decided"]["quality"]["accepted"].get<int>(), json["what_if"]["quality"]["accepted"].get<int>());
+  const auto run_json = nlohmann::json::parse(read_bytes(output / "run.json"));
+  EXPECT_EQ(run_json["options"]["decision"]["reacquisition"]["budget_s"], 11.);
+  EXPECT_GT(run_json["latency"]["decision_ms"]["max"].get<double>(), 0.);
+  EXPECT_TRUE(fs::exists(output / "report.html"));
+
+  std::ofstream(thresholds) << "decision: {quality: {acept: 0.9}}\n";
+  const Outcome wrong = run(run_svort_replay, arguments);
+  EXPECT_EQ(wrong.code, 2);
+  EXPECT_NE(wrong.err.find("unknown key 'decision.quality.acept'"), std::string::npos) << wrong.err;
 }
 
 TEST(Replay, PosesAreTheOnesOfTheMessages) {

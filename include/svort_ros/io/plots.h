@@ -24,6 +24,10 @@ struct Curve {
   std::vector<std::pair<double, double>> points;  ///< x, y; x ascending
 };
 
+/// The bytes of what plot_curves() writes. @throws std::runtime_error if it cannot be encoded
+std::string curves_png(const std::string& title, const std::string& x_label, const std::string& y_label,
+                       const std::vector<Curve>& curves);
+
 /// PNG with curves over a common x axis, both axes from 0; what lies above the 0.98 quantile of all y is cut off.
 /// @throws std::runtime_error naming the file
 void plot_curves(const std::filesystem::path& path, const std::string& title, const std::string& x_label,

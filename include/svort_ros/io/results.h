@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "svort_ros/decision/decision_engine.h"
 #include "svort_ros/live/live_pipeline.h"
 
 namespace svort {
@@ -20,8 +21,10 @@ struct RunInfo {
 /// Writes poses.csv, updates.csv, volume.nii.gz, volume.png, latency.png and run.json into `directory`, which is made
 /// if needed. Without slices, only updates.csv and run.json; files of an earlier run that this one does not write are
 /// removed. Each file is whole or not there, and run.json comes last.
+/// @param decisions if not null, also what write_decisions() writes, and report.html
 /// @throws std::runtime_error naming the file and the reason
-void write_results(const std::filesystem::path& directory, const LivePipeline& pipeline, const RunInfo& run);
+void write_results(const std::filesystem::path& directory, const LivePipeline& pipeline, const RunInfo& run,
+                   const DecisionEngine* decisions = nullptr);
 
 /// Median, 95th percentile and maximum; NaN values are left out, all NaN without any.
 struct Percentiles {

@@ -20,6 +20,8 @@ struct JournalEntry {
   double latency_ms = 0.;           ///< arrival to published pose (rejected: to the answer)
   /// Arrival to the first published volume that contains the slice; NaN if rejected or not there yet.
   double volume_latency_ms = std::numeric_limits<double>::quiet_NaN();
+  /// Arrival to the first decision that was made with the slice; NaN likewise.
+  double decision_latency_ms = std::numeric_limits<double>::quiet_NaN();
   std::size_t encoded = 0;  ///< slices that a network encoded for this revision
   std::string device;
   Pose T_brain_slice = Pose::Identity();  ///< causal pose, mm; meaningless if the slice was rejected
@@ -35,6 +37,10 @@ class Journal {
   }
   /// @throws std::out_of_range if there is no such entry
   void set_volume_latency(std::size_t entry, double latency_ms) { entries_.at(entry).volume_latency_ms = latency_ms; }
+  /// @throws std::out_of_range if there is no such entry
+  void set_decision_latency(std::size_t entry, double latency_ms) {
+    entries_.at(entry).decision_latency_ms = latency_ms;
+  }
   void clear() { entries_.clear(); }
   const std::vector<JournalEntry>& entries() const { return entries_; }
 

@@ -65,6 +65,7 @@ class AwaitingVolume {
   void clear() { items_.clear(); }
 
   struct Published {
+    Item slice;
     double latency_ms = 0.;  ///< arrival to volume
     std::string line;        ///< see progress_line()
   };

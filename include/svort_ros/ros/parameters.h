@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "svort_ros/decision/decision_engine.h"
 #include "svort_ros/live/live_pipeline.h"
 
 namespace svort_ros {
@@ -45,11 +46,13 @@ struct NodeOptions {
 struct ServerOptions {
   NodeOptions node;
   svort::PipelineOptions pipeline;
+  svort::DecisionOptions decision;
 
   template <class Visitor>
   void visit(Visitor&& v) {
     v.section("node", node);
     pipeline.visit(v);
+    v.section("decision", decision);
   }
 };
 

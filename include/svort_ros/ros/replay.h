@@ -15,6 +15,7 @@ struct ReplayOptions {
   StackInput input;        ///< or these stacks
   std::string topic;       ///< of the slices in the bag
   std::string output;      ///< folder of the results
+  std::string what_if;     ///< YAML file with other thresholds (section `decision`), to see what they would decide
   ServerOptions server;    ///< of `node` only `threads` matters here
   double realtime = 0.;    ///< 1 is the scanner's pace, 2 twice as fast; 0 is as fast as possible
   std::uint64_t seed = 0;  ///< written into run.json; the estimators draw no random numbers

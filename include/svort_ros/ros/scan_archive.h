@@ -25,13 +25,15 @@ class ScanArchive {
   bool enabled() const { return !root_.empty(); }
 
   /// Writes the scan in hand. @return its folder @throws std::runtime_error naming the file and the reason
-  std::filesystem::path save(const svort::LivePipeline& pipeline, const svort::RunInfo& run);
+  std::filesystem::path save(const svort::LivePipeline& pipeline, const svort::RunInfo& run,
+                             const svort::DecisionEngine* decisions = nullptr);
 
   /// The next save() is of another scan.
   void begin_scan() { folder_.clear(); }
 
   /// Keeps a scan that ended but could not be written; retry() tries again.
-  void keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run);
+  void keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run,
+            std::unique_ptr<svort::DecisionEngine> decisions = nullptr);
   std::size_t kept() const { return kept_.size(); }
 
   struct Retry {
@@ -44,11 +46,13 @@ class ScanArchive {
  private:
   struct Kept {
     std::unique_ptr<svort::LivePipeline> pipeline;
+    std::unique_ptr<svort::DecisionEngine> decisions;
     svort::RunInfo run;
     std::filesystem::path folder;
   };
   /// Fills `folder` if it is empty, and writes.
-  void write(const svort::LivePipeline& pipeline, const svort::RunInfo& run, std::filesystem::path* folder) const;
+  void write(const svort::LivePipeline& pipeline, const svort::RunInfo& run, const svort::DecisionEngine* decisions,
+             std::filesystem::path* folder) const;
 
   std::filesystem::path root_;
   std::filesystem::path folder_;  ///< of the scan in hand; empty until it was saved
