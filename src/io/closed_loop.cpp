@@ -54,10 +54,13 @@ class Loop {
     acquire(T_scanner_slice, kFirstRepeat + repeats_, 0, 1, decide);
   }
 
-  /// The planner's wishes, most urgent first, until there are none.
+  /// The planner's wishes, most urgent first, until there are none or the time for them is used up.
   void obey() {
     for (auto waiting = engine_.planner().waiting(); !waiting.empty(); waiting = engine_.planner().waiting()) {
       const ReacquisitionRequest request = waiting.front();
+      // The planner gives the time of a veto back, but here it was spent.
+      if (spent_s_ + request.cost_s > options_.decision.reacquisition.budget_s) return;
+      spent_s_ += request.cost_s;
       scanner_.wait(options_.decision.reacquisition.overhead_s);
       repeat(request.T_scanner_slice, true);
       // If the head has moved on, the slice shows another plane; the scanner does not try for ever.
@@ -86,6 +89,7 @@ class Loop {
   std::map<std::pair<int, int>, Pose> truth_;
   int slices_ = 0;
   int repeats_ = 0;
+  double spent_s_ = 0.;  ///< on requests
 };
 
 /// Trilinear value at a position in the volume's frame; 0 outside.

@@ -272,7 +272,9 @@ TEST_F(NodeTest, DecidesAndTakesVetoesAndThresholds) {
   EXPECT_EQ(in_use("coverage__views"), 2.6);
 
   for (const Slice& slice : synthetic_messages("decisions"))
-    if (slice.stack != 1 || slice.index != 3) ASSERT_TRUE(client_.send_and_wait(slice).kept);
+    if (slice.stack != 1 || slice.index != 3) {
+      ASSERT_TRUE(client_.send_and_wait(slice).kept);
+    }
   ASSERT_TRUE(client_.call(kFinaliseService).success);
   ASSERT_TRUE(eventually([&] { return plans.count() > 0 && !plans.all().back().requests.empty(); }));
   EXPECT_TRUE(plans.all().back().dry_run);

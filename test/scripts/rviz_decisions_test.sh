@@ -26,4 +26,4 @@ print(f"{300 * hits / len(pixels):.3f}")' "$2")
 }
 at_least "good slices (green)" 'g > 120 and r < 0.75 * g and b < 0.6 * g' 1
 at_least "planned slices (magenta)" 'r > 150 and b > 130 and g < 0.7 * b' 0.1
-at_least "anything at all" 'max(r, g, b) > 60' 5
+at_least "anything at all" 'max(r, g, b) > 60' 3
