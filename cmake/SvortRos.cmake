@@ -65,9 +65,3 @@ svort_target_options(svort_nodelet)
 set_target_properties(svort_nodelet PROPERTIES
   LIBRARY_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_LIB_DESTINATION})
 list(APPEND SVORT_LIBRARIES svort_nodelet)
-
-# Tests with a ROS master of their own.
-if(SVORT_BUILD_TESTS)
-  enable_testing()
-  add_subdirectory(test/ros)
-endif()

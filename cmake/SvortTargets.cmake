@@ -2,7 +2,8 @@
 
 find_program(CCACHE_PROGRAM ccache)
 if(CCACHE_PROGRAM AND NOT CMAKE_CXX_COMPILER_LAUNCHER)
-  set(CMAKE_CXX_COMPILER_LAUNCHER ${CCACHE_PROGRAM})
+  # Without these, ccache does not keep what was compiled with precompiled headers.
+  set(CMAKE_CXX_COMPILER_LAUNCHER ${CMAKE_COMMAND} -E env CCACHE_SLOPPINESS=pch_defines,time_macros ${CCACHE_PROGRAM})
 endif()
 
 # Warnings and sanitizers of this project's own targets.
@@ -19,16 +20,40 @@ function(svort_target_options target)
   endif()
 endfunction()
 
+# LibTorch's and Eigen's headers take most of the time of most files: they are compiled once per kind of target.
+option(SVORT_PRECOMPILED_HEADERS "Compile LibTorch's and Eigen's headers once" ON)
+set(svort_precompiled_headers <torch/types.h> <Eigen/Core> <Eigen/Geometry> <string> <vector>)
+
+# svort_precompile_headers(<target> <owner> [<header>...])
+# The first target of a kind names itself as the owner; all others of the kind, compiled with the same options, reuse
+# what it precompiles.
+function(svort_precompile_headers target owner)
+  if(NOT SVORT_PRECOMPILED_HEADERS)
+    return()
+  endif()
+  if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
+    target_compile_options(${target} PRIVATE -fpch-preprocess)  # ccache needs it
+  endif()
+  if(target STREQUAL owner)
+    target_precompile_headers(${target} PRIVATE ${svort_precompiled_headers} ${ARGN})
+  else()
+    target_precompile_headers(${target} REUSE_FROM ${owner})
+  endif()
+endfunction()
+
 # svort_library(<name> MODULE <folder of src/> LINK <libraries>...)
 # All .cpp files of the folder become one shared library.
 function(svort_library name)
   cmake_parse_arguments(ARG "" "MODULE" "LINK" ${ARGN})
   file(GLOB sources CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/src/${ARG_MODULE}/*.cpp)
   add_library(${name} SHARED ${sources})
+  # No macro of its own: it would keep libraries from sharing the precompiled headers.
+  set_target_properties(${name} PROPERTIES DEFINE_SYMBOL "")
   target_include_directories(${name} PUBLIC $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/include>
                                             $<INSTALL_INTERFACE:include>)
   target_link_libraries(${name} PUBLIC ${ARG_LINK})
   svort_target_options(${name})
+  svort_precompile_headers(${name} svort_geometry)
 endfunction()
 
 # Adds src/<folder>/cuda to a library: kernels (.cu) and what calls them.

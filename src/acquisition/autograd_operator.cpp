@@ -1,6 +1,7 @@
 #include "autograd_operator.h"
 
-#include <torch/torch.h>
+#include <torch/autograd.h>
+#include <torch/types.h>
 
 namespace svort {
 namespace {

@@ -1,6 +1,6 @@
 #include "svort_ros/acquisition/geometry_of_poses.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cstdint>
 #include <map>

@@ -1,6 +1,6 @@
 #include "plain_operator.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <array>
 #include <utility>

@@ -1,6 +1,6 @@
 #include "svort_ros/acquisition/slice_acquisition.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <limits>

@@ -1,7 +1,8 @@
 #include "network_bench.h"
 
 #include <ATen/Parallel.h>
-#include <torch/torch.h>
+#include <torch/cuda.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <chrono>
@@ -14,6 +15,7 @@
 #include <sstream>
 #include <stdexcept>
 
+#include "bench_support.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/network/checkpoint.h"
 #include "svort_ros/network/deterministic_weights.h"
@@ -50,28 +52,6 @@ struct Options {
   RunnerOptions runner;
 };
 
-std::vector<std::string> items(const std::string& text) {
-  std::vector<std::string> list;
-  std::istringstream stream(text);
-  for (std::string item; std::getline(stream, item, ',');) list.push_back(item);
-  return list;
-}
-
-std::vector<std::int64_t> positive_integers(const std::string& name, const std::string& text) {
-  std::vector<std::int64_t> values;
-  for (const std::string& item : items(text)) {
-    constexpr std::int64_t kLargest = 5000;
-    std::istringstream stream(item);
-    std::int64_t value = 0;
-    if (!(stream >> value) || !stream.eof() || value < 1 || value > kLargest)
-      throw std::invalid_argument(name + " takes integers from 1 to " + std::to_string(kLargest) + ", got '" + text +
-                                  "'");
-    values.push_back(value);
-  }
-  if (values.empty()) throw std::invalid_argument(name + " needs a value");
-  return values;
-}
-
 Options parse(const std::vector<std::string>& arguments) {
   Options options;
   for (std::size_t i = 0; i < arguments.size(); i += 2) {
@@ -79,15 +59,15 @@ Options parse(const std::vector<std::string>& arguments) {
     if (i + 1 == arguments.size()) throw std::invalid_argument(name + " is unknown or needs a value");
     const std::string& value = arguments[i + 1];
     if (name == "--networks")
-      options.networks = items(value);
+      options.networks = list_items(value);
     else if (name == "--weights")
       options.weights = value;
     else if (name == "--slices")
-      options.slices = positive_integers(name, value);
+      options.slices = positive_integers(name, value, 5000);
     else if (name == "--threads")
-      options.threads = positive_integers(name, value);
+      options.threads = positive_integers(name, value, 5000);
     else if (name == "--repetitions")
-      options.repetitions = positive_integers(name, value).front();
+      options.repetitions = positive_integers(name, value, 5000).front();
     else if (name == "--device")
       options.runner.device = value;
     else if (name == "--precision")
@@ -125,14 +105,6 @@ NetworkInput scan_of(std::int64_t n) {
   input.slice_counts = torch::full({n}, per_stack, torch::kInt64);
   input.times = torch::arange(n, torch::kFloat32);
   return input;
-}
-
-double peak_memory_mb() {
-  std::ifstream status("/proc/self/status");
-  for (std::string line; std::getline(status, line);) {
-    if (line.rfind("VmHWM:", 0) == 0) return std::stod(line.substr(6)) / 1024.;
-  }
-  throw std::runtime_error("/proc/self/status has no line VmHWM");
 }
 
 void bench(const NetworkInstance& network, const Options& options) {

@@ -1,9 +1,9 @@
 // Benchmarks of the core, one JSON object per line. `svort_bench forward` measures the acquisition operator,
-// `svort_bench network` the pose networks (network_bench.cpp).
+// `svort_bench network` the pose networks (network_bench.cpp), `svort_bench live` the live pipeline (live_bench.cpp).
 
 #include <ATen/Parallel.h>
 #include <sys/resource.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <array>
@@ -20,6 +20,8 @@
 #include <string>
 #include <vector>
 
+#include "bench_support.h"
+#include "live_bench.h"
 #include "network_bench.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
@@ -30,6 +32,9 @@ namespace {
 
 using svort::AcquisitionFormulation;
 using svort::AcquisitionGeometry;
+using svort::peak_memory_mb;
+using svort::positive_integers;
+using svort::processor;
 using svort::SliceAcquisition;
 
 constexpr const char* kUsage =
@@ -63,28 +68,8 @@ struct Options {
 
 constexpr int kSize = 128;  // pixels along each side of a slice
 
-std::vector<std::int64_t> positive_integers(const std::string& name, const std::string& text, std::int64_t largest) {
-  std::vector<std::int64_t> values;
-  std::istringstream list(text);
-  for (std::string item; std::getline(list, item, ',');) {
-    std::size_t used = 0;
-    std::int64_t value = 0;
-    try {
-      value = std::stoll(item, &used);
-    } catch (const std::logic_error&) {
-      used = 0;
-    }
-    if (used == 0 || used != item.size() || value < 1 || value > largest) {
-      throw UsageError(name + " takes integers from 1 to " + std::to_string(largest) + ", got '" + text + "'");
-    }
-    values.push_back(value);
-  }
-  if (values.empty()) throw UsageError(name + " needs a value");
-  return values;
-}
-
 Options parse(const std::vector<std::string>& arguments) {
-  if (arguments.empty() || arguments[0] != "forward") throw UsageError("the first argument must be forward or network");
+  if (arguments.empty() || arguments[0] != "forward") throw UsageError("the first argument must be forward, network or live");
   Options options;
   for (std::size_t i = 1; i < arguments.size(); i += 2) {
     const std::string& name = arguments[i];
@@ -131,15 +116,6 @@ double copy_gb_per_s() {
   std::vector<char> to(from.size());
   const double ms = best_ms(5, [&] { std::memcpy(to.data(), from.data(), from.size()); });
   return 2. * static_cast<double>(from.size()) / ms / 1e6;
-}
-
-// Largest resident memory since reset_peak_memory(), in MB.
-double peak_memory_mb() {
-  std::ifstream status("/proc/self/status");
-  for (std::string line; std::getline(status, line);) {
-    if (line.rfind("VmHWM:", 0) == 0) return std::stod(line.substr(6)) / 1024.;
-  }
-  throw std::runtime_error("/proc/self/status has no line VmHWM");
 }
 
 void reset_peak_memory() {
@@ -407,15 +383,6 @@ void print_table(const std::vector<Row>& rows, bool with_size, std::ostream& out
   }
 }
 
-std::string processor() {
-  std::ifstream file("/proc/cpuinfo");
-  for (std::string line; std::getline(file, line);) {
-    const std::size_t colon = line.find(": ");
-    if (line.rfind("model name", 0) == 0 && colon != std::string::npos) return line.substr(colon + 2);
-  }
-  return "unknown processor";
-}
-
 void run(const Options& options) {
   const double bandwidth = copy_gb_per_s();
   std::ostream& log = options.table ? std::cerr : std::cout;
@@ -459,16 +426,19 @@ void run(const Options& options) {
 int main(int argc, char** argv) {
   const std::vector<std::string> arguments(argv + 1, argv + argc);
   if (arguments.size() == 1 && (arguments[0] == "--help" || arguments[0] == "-h")) {
-    std::cout << kUsage << svort::kNetworkBenchUsage;
+    std::cout << kUsage << svort::kNetworkBenchUsage << svort::kLiveBenchUsage;
     return 0;
   }
   try {
     if (!arguments.empty() && arguments[0] == "network")
       svort::run_network_bench({arguments.begin() + 1, arguments.end()});
+    else if (!arguments.empty() && arguments[0] == "live")
+      svort::run_live_bench({arguments.begin() + 1, arguments.end()});
     else
       run(parse(arguments));
   } catch (const UsageError& error) {
-    std::cerr << "svort_bench: " << error.what() << "\n" << kUsage << svort::kNetworkBenchUsage;
+    std::cerr << "svort_bench: " << error.what() << "\n"
+              << kUsage << svort::kNetworkBenchUsage << svort::kLiveBenchUsage;
     return 2;
   } catch (const std::invalid_argument& error) {
     std::cerr << "svort_bench: " << error.what() << "\n";

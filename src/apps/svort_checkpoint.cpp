@@ -1,6 +1,6 @@
 // Files of network weights: what is in one, which parameters a network has, and weights that have learnt nothing.
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <iomanip>
 #include <iostream>

@@ -1,6 +1,6 @@
 #include "svort_ros/geometry/anchor_points.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <stdexcept>
 

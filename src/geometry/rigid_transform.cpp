@@ -1,6 +1,6 @@
 #include "svort_ros/geometry/rigid_transform.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <Eigen/LU>
 #include <Eigen/SVD>

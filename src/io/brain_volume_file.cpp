@@ -1,6 +1,6 @@
 #include "svort_ros/io/brain_volume_file.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <array>
 #include <cmath>

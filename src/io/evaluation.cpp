@@ -1,6 +1,6 @@
 #include "svort_ros/io/evaluation.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <CLI/CLI.hpp>
 #include <cstdio>

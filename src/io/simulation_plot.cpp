@@ -1,6 +1,6 @@
 #include "svort_ros/io/simulation_plot.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <array>

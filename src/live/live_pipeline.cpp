@@ -38,6 +38,12 @@ bool LivePipeline::update_volume() {
   return true;
 }
 
+bool LivePipeline::improve() {
+  if (sequence_.slices().empty() || !estimator_->improve(sequence_)) return false;
+  volume_is_stale_ = true;
+  return true;
+}
+
 bool LivePipeline::finalise() {
   if (sequence_.slices().empty() || estimate().final) return false;
   estimator_->finalise(sequence_);

@@ -1,6 +1,6 @@
 #include "svort_ros/live/registration_estimator.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <Eigen/Geometry>
 #include <algorithm>
@@ -42,6 +42,11 @@ RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, st
   svort::validate(options);
   validate(options.registration);
   validate(options.template_match);
+  validate(options.incremental);
+  if (options.update != "incremental" && options.update != "full")
+    throw std::invalid_argument("estimator.update is '" + options.update + "'; known: incremental, full");
+  if (options.budget != "iterations" && options.budget != "time")
+    throw std::invalid_argument("estimator.budget is '" + options.budget + "'; known: iterations, time");
   formulation_ = acquisition_formulation(options.formulation);
   grid_ = volume_grid(options);
 }
@@ -111,18 +116,118 @@ void RegistrationEstimator::add(const SliceSequence& sequence) {
       move_frame(T_new_old);
     }
   }
-  if (slices.size() >= kFewestSlices) {
+  if (options_.update == "incremental") {
+    add_incrementally(sequence, position);
+  } else if (slices.size() >= kFewestSlices) {
     const std::vector<Pose> start = crop_poses(sequence);
-    const RegistrationInput input = input_of(sequence);
-    take(sequence, refine_poses(input, start, options_.registration, RefinementEffort::warm), start);
-    const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
-    if (slices.size() >= kFewestForTemplate &&
-        (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches)))
-      align_to_template(sequence, input);
+    take(sequence, refine_poses(input_of(sequence), start, options_.registration, RefinementEffort::warm), start);
+  }
+  const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
+  if (slices.size() >= kFewestForTemplate &&
+      (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches))) {
+    align_to_template(sequence, input_of(sequence));
   }
   estimate_.scan_id = sequence.scan_id();
   estimate_.final = false;
   ++estimate_.revision;
+}
+
+void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std::size_t position) {
+  const SliceSequenceOptions& prepared = sequence.options();
+  if (!incremental_)
+    incremental_ = std::make_unique<IncrementalRefinement>(options_.registration, options_.incremental,
+                                                           prepared.resolution_mm, options_.volume_size_mm);
+  const PreparedSlice& newest = *sequence.slices()[position];
+  std::vector<SliceEstimate>& slices = estimate_.slices;
+  IncrementalSlice slice;
+  slice.pixels = torch::empty({prepared.size_px, prepared.size_px}, torch::kFloat32);
+  slice.mask = torch::empty({prepared.size_px, prepared.size_px}, torch::kBool);
+  std::copy(newest.pixels.begin(), newest.pixels.end(), slice.pixels.data_ptr<float>());
+  std::transform(newest.mask.begin(), newest.mask.end(), slice.mask.data_ptr<bool>(),
+                 [](std::uint8_t value) { return value != 0; });
+  slice.T_world_slice = newest.info.T_scanner_slice * newest.T_slice_crop;
+  slice.stack = newest.info.stack;
+  slice.thickness_mm = newest.info.thickness;
+  // The engine's frame is the published one, but for what holding that moved it since.
+  Pose T_engine_brain = Pose::Identity();
+  if (incremental_->count() > 0) {
+    const std::size_t old = position == 0 ? 1 : 0;
+    T_engine_brain = incremental_->slices().front().T_brain_slice *
+                     (slices[old].T_brain_slice * sequence.slices()[old]->T_slice_crop).inverse();
+  }
+  const auto start = [&](const Pose& T_scanner_brain) -> Pose {
+    return T_engine_brain * T_scanner_brain.inverse() * slice.T_world_slice;
+  };
+  const Pose predicted = start(slices[position].T_scanner_brain);
+  incremental_->insert(position, slice, predicted, sequence.intensity_scale());
+  // The head may have gone back to where it was when its stack, or the scan, began.
+  std::vector<PoseCandidate> candidates = {{"prediction", predicted}};
+  const auto same_stack = [&](const SliceEstimate& each) { return each.info.stack == newest.info.stack; };
+  const auto began = std::find_if(slices.begin(), slices.end(), same_stack);
+  for (const auto& [name, where] : {std::pair{"stack begin", began}, std::pair{"scan begin", slices.begin()}})
+    if (where != slices.begin() + static_cast<std::ptrdiff_t>(position))
+      candidates.push_back({name, start(where->T_scanner_brain)});
+  slices[position].start = incremental_->choose(position, candidates).name;
+  incremental_->refine_around(position);
+  for (int i = 0; i < options_.incremental.sweeps; ++i) incremental_->sweep();
+  take_incremental(sequence, position);
+  idle_left_ = incremental_->windows();
+  idle_motion_mm_ = 0.;
+}
+
+void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std::size_t newest) {
+  const bool registered = estimate_.slices.size() >= kFewestSlices;
+  // The slices that were here hold the frame where it was.
+  std::vector<Pose> before, after;
+  for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
+    if (i == newest) continue;
+    before.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
+    after.push_back(incremental_->slices()[i].T_brain_slice);
+  }
+  const double half_field = 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
+  const Pose held = before.empty() ? Pose::Identity() : best_fit(after, before, half_field);
+  for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
+    SliceEstimate& slice = estimate_.slices[i];
+    const RefinedSlice& refined = incremental_->slices()[i];
+    slice.T_brain_slice = held * refined.T_brain_slice * sequence.slices()[i]->T_slice_crop.inverse();
+    slice.T_scanner_brain = slice.info.T_scanner_slice * slice.T_brain_slice.inverse();
+    if (!registered) continue;
+    slice.weight = refined.weight;
+    slice.reason = refined.reason;
+    slice.status = refined.weight > 0. ? PoseStatus::registered : PoseStatus::outlier;
+  }
+  take_uncertainty();
+}
+
+void RegistrationEstimator::take_uncertainty() {
+  std::vector<SliceEstimate>& slices = estimate_.slices;
+  const bool one_stack = std::all_of(slices.begin(), slices.end(), [&](const SliceEstimate& slice) {
+    return slice.info.stack == slices.front().info.stack;
+  });
+  const double factor = one_stack ? options_.radius_factor_one_stack : options_.radius_factor;
+  for (std::size_t i = 0; i < slices.size(); ++i) slices[i].radius_95_mm = factor * incremental_->slices()[i].sigma_mm;
+}
+
+void RegistrationEstimator::tell_incremental(const SliceSequence& sequence) {
+  std::vector<RefinedSlice> slices = incremental_->slices();
+  const std::vector<Pose> poses = crop_poses(sequence);
+  for (std::size_t i = 0; i < slices.size(); ++i) {
+    slices[i].T_brain_slice = poses[i];
+    slices[i].weight = estimate_.slices[i].weight;
+    slices[i].reason = estimate_.slices[i].reason;
+  }
+  incremental_->set(slices);
+}
+
+bool RegistrationEstimator::improve(const SliceSequence& sequence) {
+  if (!incremental_ || options_.budget != "time" || idle_left_ == 0 || estimate_.final) return false;
+  idle_motion_mm_ = std::max(idle_motion_mm_, incremental_->sweep());
+  // A whole sweep that still moved something is worth another one.
+  if (--idle_left_ == 0 && std::exchange(idle_motion_mm_, 0.) > options_.registration.convergence_mm)
+    idle_left_ = incremental_->windows();
+  take_incremental(sequence, estimate_.slices.size());
+  ++estimate_.revision;
+  return idle_left_ > 0;
 }
 
 void RegistrationEstimator::take(const SliceSequence& sequence, const Refinement& refinement,
@@ -149,6 +254,10 @@ void RegistrationEstimator::move_frame(const Pose& T_new_old) {
     slice.T_scanner_brain = slice.T_scanner_brain * T_new_old.inverse();
   }
   ++estimate_.frame_revision;
+  if (!incremental_) return;
+  std::vector<RefinedSlice> slices = incremental_->slices();
+  for (RefinedSlice& slice : slices) slice.T_brain_slice = T_new_old * slice.T_brain_slice;
+  incremental_->set(slices);
 }
 
 void RegistrationEstimator::align_to_template(const SliceSequence& sequence, const RegistrationInput& input) {
@@ -190,6 +299,11 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
     const Refinement from_nominal = refine_poses(input, nominal, options_.registration);
     take(sequence, from_current.report.last_cost <= from_nominal.report.last_cost ? from_current : from_nominal,
          current);
+    if (incremental_) {
+      tell_incremental(sequence);
+      incremental_->measure_uncertainty();
+      take_uncertainty();
+    }
     align_to_template(sequence, input);
   }
   volume_ = estimate_volume(sequence, grid_, formulation_, options_.final_cg_iterations, &estimate_.slices);
@@ -202,6 +316,8 @@ void RegistrationEstimator::reset() {
   estimate_ = Estimate();
   estimate_.revision = revision;
   volume_ = Volume();
+  incremental_.reset();
+  idle_left_ = 0;
   aligned_ = false;
   aligned_count_ = 0;
 }

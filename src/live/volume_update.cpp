@@ -1,6 +1,6 @@
 #include "svort_ros/live/volume_update.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 #include <limits>

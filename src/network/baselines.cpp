@@ -1,5 +1,9 @@
 #include "svort_ros/network/baselines.h"
 
+#include <torch/nn/modules/activation.h>
+#include <torch/nn/modules/conv.h>
+#include <torch/nn/modules/normalization.h>
+
 #include <cmath>
 #include <numeric>
 #include <stdexcept>

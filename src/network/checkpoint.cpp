@@ -1,5 +1,7 @@
 #include "svort_ros/network/checkpoint.h"
 
+#include <torch/serialize.h>
+
 #include <fstream>
 #include <iterator>
 #include <sstream>

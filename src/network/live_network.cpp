@@ -1,5 +1,7 @@
 #include "svort_ros/network/live_network.h"
 
+#include <torch/nn/init.h>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>

@@ -1,5 +1,7 @@
 #include "svort_ros/network/network_runner.h"
 
+#include <torch/cuda.h>
+
 #include <stdexcept>
 #include <utility>
 

@@ -1,6 +1,6 @@
 #include "svort_ros/network/pose_consensus.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <Eigen/Core>
 #include <Eigen/SVD>

@@ -1,5 +1,7 @@
 #include "svort_ros/network/svort.h"
 
+#include <torch/nn/modules/container/modulelist.h>
+
 #include <cmath>
 #include <stdexcept>
 #include <string>

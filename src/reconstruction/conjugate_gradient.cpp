@@ -1,6 +1,6 @@
 #include "conjugate_gradient.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <array>

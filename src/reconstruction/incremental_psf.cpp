@@ -1,6 +1,6 @@
 #include "svort_ros/reconstruction/incremental_psf.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <stdexcept>

@@ -1,6 +1,6 @@
 #include "svort_ros/reconstruction/volume_estimation.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <array>
 #include <cmath>

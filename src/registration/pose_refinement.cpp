@@ -1,6 +1,6 @@
 #include "svort_ros/registration/pose_refinement.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <cmath>
@@ -12,6 +12,7 @@
 
 #include "../acquisition/parallel.h"
 #include "registration_level.h"
+#include "slice_weight.h"
 #include "svort_ros/acquisition/geometry_of_poses.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
@@ -218,21 +219,7 @@ class Refiner {
   }
 
   void weigh() {
-    for (RefinedSlice& slice : slices_) {
-      slice.reason.clear();
-      if (!std::isfinite(slice.ncc)) {
-        slice.weight = 0.;
-        slice.reason = "too few pixels, or none that differ";
-      } else if (slice.ncc < options_.outlier_ncc) {
-        slice.weight = 0.;
-        std::ostringstream reason;
-        reason.precision(2);
-        reason << std::fixed << "correlation " << slice.ncc << " with the volume, below " << options_.outlier_ncc;
-        slice.reason = reason.str();
-      } else {
-        slice.weight = std::pow(slice.ncc, 4.);
-      }
-    }
+    for (RefinedSlice& slice : slices_) weigh_slice(options_.outlier_ncc, &slice);
     // All of them outliers: then none is, or there would be no volume to return to.
     if (std::all_of(slices_.begin(), slices_.end(), [](const RefinedSlice& s) { return s.weight == 0.; }))
       for (RefinedSlice& slice : slices_)

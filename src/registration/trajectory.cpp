@@ -44,12 +44,43 @@ bool solve_block_tridiagonal(std::vector<Matrix6d> diagonal, const std::vector<M
   return true;
 }
 
+std::vector<Matrix6d> block_tridiagonal_inverse(const std::vector<Matrix6d>& diagonal,
+                                                const std::vector<Matrix6d>& upper) {
+  const std::size_t n = diagonal.size();
+  if (n > 0 && upper.size() + 1 != n) throw std::logic_error("block_tridiagonal_inverse: sizes do not fit");
+  // What elimination from either end leaves of a block; together they are the block's Schur complement.
+  std::vector<Matrix6d> from_front = diagonal, from_back = diagonal;
+  Eigen::LLT<Matrix6d> pivot;
+  for (std::size_t i = 1; i < n; ++i) {
+    pivot.compute(from_front[i - 1]);
+    if (pivot.info() != Eigen::Success) return {};
+    from_front[i] -= upper[i - 1].transpose() * pivot.solve(upper[i - 1]);
+  }
+  for (std::size_t i = n; i-- > 1;) {
+    pivot.compute(from_back[i]);
+    if (pivot.info() != Eigen::Success) return {};
+    from_back[i - 1] -= upper[i - 1] * pivot.solve(upper[i - 1].transpose());
+  }
+  std::vector<Matrix6d> inverse(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    pivot.compute(from_front[i] + from_back[i] - diagonal[i]);
+    if (pivot.info() != Eigen::Success) return {};
+    inverse[i] = pivot.solve(Matrix6d::Identity());
+  }
+  return inverse;
+}
+
 double motion_size(const Vector6d& twist, double lever_mm) {
   return std::sqrt(lever_mm * lever_mm * twist.head<3>().squaredNorm() + twist.tail<3>().squaredNorm());
 }
 
+double expected_motion_size(const Matrix6d& covariance, double lever_mm) {
+  return std::sqrt(lever_mm * lever_mm * covariance.diagonal().head<3>().sum() + covariance.diagonal().tail<3>().sum());
+}
+
 std::vector<Vector6d> solve_trajectory(const std::vector<SliceTerms>& terms, const std::vector<Pose>& motions,
-                                       const std::vector<double>& spread_mm, const WalkOptions& options) {
+                                       const std::vector<double>& spread_mm, const WalkOptions& options,
+                                       std::vector<Matrix6d>* covariance) {
   const std::size_t n = terms.size();
   std::vector<Matrix6d> diagonal(n), upper(n > 0 ? n - 1 : 0, Matrix6d::Zero());
   std::vector<Vector6d> right(n);
@@ -76,6 +107,7 @@ std::vector<Vector6d> solve_trajectory(const std::vector<SliceTerms>& terms, con
   }
   // A whisper of damping: directions that neither images nor neighbours see stay where they are.
   for (Matrix6d& block : diagonal) block.diagonal() += 1e-6 * metric;
+  if (covariance != nullptr) *covariance = block_tridiagonal_inverse(diagonal, upper);
   if (!solve_block_tridiagonal(diagonal, upper, &right)) right.assign(n, Vector6d::Zero());
   return right;
 }

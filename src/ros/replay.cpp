@@ -75,11 +75,15 @@ class OutputFolders {
   std::map<std::string, int> used_;
 };
 
-/// Sleeps until the slice is due, and says when that was: waiting behind others counts as latency.
-Clock::time_point wait_for(const Slice& message, const Slice& first, Clock::time_point start, double realtime) {
+/// Improves poses (budget "time") and sleeps until the slice is due, and says when that was: waiting behind others
+/// counts as latency.
+Clock::time_point wait_for(const Slice& message, const Slice& first, Clock::time_point start, double realtime,
+                           svort::LivePipeline* pipeline) {
   if (realtime <= 0.) return Clock::now();
   const double offset_s = std::max(0., (message.header.stamp - first.header.stamp).toSec() / realtime);
   const auto due = start + std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(offset_s));
+  while (Clock::now() < due && pipeline->improve()) {
+  }
   std::this_thread::sleep_until(due);
   return due;
 }
@@ -148,7 +152,7 @@ ReplaySummary replay(const ReplayOptions& options) {
   {
     const Display display(messages.size());
     for (const Slice& message : messages) {
-      const Clock::time_point arrived = wait_for(message, messages.front(), start, options.realtime);
+      const Clock::time_point arrived = wait_for(message, messages.front(), start, options.realtime, &pipeline);
       const SliceFromMessage decoded = from_msg(message);
       const svort::Arrival arrival = decoded.ok ? pipeline.add(decoded.slice) : rejection(decoded);
       svort::JournalEntry entry = make_journal_entry(pipeline, decoded.slice.info, arrival);
@@ -240,6 +244,10 @@ int run_svort_replay(int argc, char** argv) {
       ->check(CLI::IsMember({"auto", "cpu", "cuda"}))
       ->capture_default_str();
   app.add_option("--realtime", options.realtime, "1: the scanner's pace, 2: twice as fast, 0: as fast as possible")
+      ->capture_default_str();
+  app.add_option("--budget", options.server.pipeline.estimator.budget,
+                 "iterations: the same poses in every run; time: with --realtime, improve poses while none arrives")
+      ->check(CLI::IsMember({"iterations", "time"}))
       ->capture_default_str();
   app.add_option("--seed", options.seed, "seed of random numbers; kept in run.json")->capture_default_str();
   app.add_option("--what-if", options.what_if,

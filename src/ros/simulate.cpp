@@ -1,6 +1,6 @@
 #include "svort_ros/ros/simulate.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <CLI/CLI.hpp>
 #include <algorithm>

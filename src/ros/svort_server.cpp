@@ -136,6 +136,7 @@ class SvortServer::Worker {
   svort::Arrival take_in(const SliceFromMessage& decoded);
   void end_scan();
   void update_volume();
+  void improve();
   void report_estimator();
   void publish_volume();
   void decide();
@@ -211,6 +212,7 @@ void SvortServer::Worker::run() {
     // A volume takes longer than a slice: it waits for a pause, but in a steady stream not forever.
     const auto limit = static_cast<std::size_t>(options_.node.volume_every);
     if (awaiting_volume_.size() > 0 && (inbox_.size() == 0 || awaiting_volume_.size() >= limit)) update_volume();
+    if (inbox_.size() == 0) improve();
   }
   save_at_exit();
 }
@@ -320,6 +322,17 @@ void SvortServer::Worker::update_volume() {
     publish_volume();
   });
   if (!worked) awaiting_volume_.clear();  // the next slice is the next attempt
+}
+
+void SvortServer::Worker::improve() {
+  bool improved = false;
+  guarded([&] {
+    while (inbox_.size() == 0 && pipeline_->improve()) improved = true;
+  });
+  if (!improved) return;
+  guarded([&] { publisher_.publish_transforms(*pipeline_); });
+  publish_estimate();
+  if (inbox_.size() == 0) update_volume();
 }
 
 void SvortServer::Worker::publish_volume() {

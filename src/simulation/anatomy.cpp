@@ -1,6 +1,7 @@
 #include "svort_ros/simulation/anatomy.h"
 
-#include <torch/torch.h>
+#include <torch/nn/functional/vision.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <array>

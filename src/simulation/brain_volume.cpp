@@ -1,6 +1,7 @@
 #include "svort_ros/simulation/brain_volume.h"
 
-#include <torch/torch.h>
+#include <torch/serialize.h>
+#include <torch/types.h>
 
 #include <array>
 #include <cmath>

@@ -1,7 +1,7 @@
 #include "svort_ros/simulation/scan_simulator.h"
 
 #include <ATen/Context.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <array>

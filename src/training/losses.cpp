@@ -1,6 +1,6 @@
 #include "svort_ros/training/losses.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 namespace svort {
 

@@ -1,6 +1,8 @@
 #include "svort_ros/training/trainer.h"
 
 #include <ATen/Parallel.h>
+#include <torch/nn/utils/clip_grad.h>
+#include <torch/serialize.h>
 
 #include <algorithm>
 #include <chrono>

@@ -2,7 +2,7 @@
 // them, against the vectorised operator.
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <numeric>

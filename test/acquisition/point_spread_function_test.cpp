@@ -1,7 +1,7 @@
 #include "svort_ros/acquisition/point_spread_function.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 #include <limits>

@@ -1,7 +1,7 @@
 #include "svort_ros/io/brain_volume_file.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include "io/scratch.h"
 #include "svort_ros/io/nifti.h"

@@ -1,7 +1,7 @@
 #include "svort_ros/network/baselines.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <memory>
 #include <string>

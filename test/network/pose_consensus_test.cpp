@@ -1,7 +1,7 @@
 #include "svort_ros/network/pose_consensus.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 #include <limits>

@@ -1,6 +1,6 @@
 #pragma once
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/network/network_registry.h"

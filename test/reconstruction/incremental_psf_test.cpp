@@ -1,7 +1,7 @@
 #include "svort_ros/reconstruction/incremental_psf.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <cmath>

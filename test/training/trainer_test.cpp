@@ -1,7 +1,7 @@
 #include "svort_ros/training/trainer.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/optim/adamw.h>
 
 #include <cmath>
 #include <filesystem>

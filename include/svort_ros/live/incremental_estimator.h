@@ -1,12 +1,14 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/geometry/pose.h"
+#include "svort_ros/registration/incremental_refinement.h"
 #include "svort_ros/registration/pose_refinement.h"
 #include "svort_ros/registration/template_registration.h"
 #include "svort_ros/sequence/slice_sequence.h"
@@ -34,6 +36,11 @@ struct SliceEstimate {
   double ncc = 0.;
   PoseStatus status = PoseStatus::nominal;
   std::string reason;  ///< why the weight is 0; empty otherwise
+  /// What the slice was first registered from: "prediction", "nominal" or "network". Empty: it was not.
+  std::string start;
+  /// 95 % of slices lie closer to their true place than this, relative to the others (root mean square over the head),
+  /// mm; see docs/live.md for how it is calibrated. NaN while unknown.
+  double radius_95_mm = std::numeric_limits<double>::quiet_NaN();
 };
 
 /// One published state. All poses belong together; the volume may be from an earlier revision.
@@ -71,23 +78,37 @@ struct NetworkEstimatorOptions {
 
 struct EstimatorOptions {
   std::string method = "registration";  ///< which implementation; see make_estimator
+  /// How "registration" takes in a slice: "incremental", or "full": all slices are registered again, at a cost that
+  /// grows with their number.
+  std::string update = "incremental";
+  /// "iterations": poses depend on the slices and their order alone, live and in replay. "time": they are improved for
+  /// as long as nothing arrives, and depend on the time that leaves.
+  std::string budget = "iterations";
   std::string templates;  ///< folder of NIfTI brains in canonical orientation; empty: the frame has the scanner's axes
-  std::string formulation = "fast";   ///< of the forward model; "exact" to match the public implementation to rounding
-  double volume_resolution_mm = 1.0;  ///< voxel size of the volume
-  double volume_size_mm = 128.0;      ///< edge of the cube that is reconstructed, centred on the brain frame
-  double recentre_mm = 10.0;          ///< the brain frame moves only when its centre is off by more than this
-  int cg_iterations = 0;              ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
+  std::string formulation = "fast";  ///< of the forward model; "exact" to match the public implementation to rounding
+  /// SliceEstimate::radius_95_mm over what the registration's equations expect; calibrated, see docs/live.md.
+  double radius_factor = 1.;
+  double radius_factor_one_stack = 1.;  ///< the same, while there is one stack
+  double volume_resolution_mm = 1.0;    ///< voxel size of the volume
+  double volume_size_mm = 128.0;        ///< edge of the cube that is reconstructed, centred on the brain frame
+  double recentre_mm = 10.0;            ///< the brain frame moves only when its centre is off by more than this
+  int cg_iterations = 0;                ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
   /// The same, in finalise(). More sharpen the volume where poses are right, and fit noise and motion where not.
   int final_cg_iterations = 2;
   NetworkEstimatorOptions network;
   RefinementOptions registration;
+  IncrementalOptions incremental;
   TemplateOptions template_match;
 
   template <class Visitor>
   void visit(Visitor&& v) {
     v("method", method, "registration (of slices to the volume), network, or nominal (the scanner's poses, no motion)");
+    v("update", update, "how registration takes in a slice: incremental, or full (all slices again)");
+    v("budget", budget, "iterations: live as in replay; time: improve poses for as long as nothing arrives");
     v("templates", templates, "folder of NIfTI brains in canonical orientation (LPS); empty: scanner's axes");
     v("formulation", formulation, "forward model: fast, or exact (every tap of the slice profile, ten times slower)");
+    v("radius_factor", radius_factor, "95 % radius of a pose over its expected error; calibrated");
+    v("radius_factor_one_stack", radius_factor_one_stack, "the same, while there is one stack");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume, mm");
     v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
     v("recentre_mm", recentre_mm, "the brain frame moves only when the brain's centre is off by more than this, mm");
@@ -95,6 +116,7 @@ struct EstimatorOptions {
     v("final_cg_iterations", final_cg_iterations, "conjugate-gradient steps of the final volume");
     v.section("network", network);
     v.section("registration", registration);
+    v.section("incremental", incremental);
     v.section("template_match", template_match);
   }
 };
@@ -118,6 +140,10 @@ class IncrementalEstimator {
 
   /// Estimates the volume (and each slice's ncc) from the current poses.
   virtual void update_volume(const SliceSequence& sequence) = 0;
+
+  /// Improves the poses of slices that are already there, for as long as nothing arrives; quick, call it again.
+  /// @return false if there is nothing left to improve
+  virtual bool improve(const SliceSequence& /*sequence*/) { return false; }
 
   /// Brings poses and volume to their best state; called when the scan, or a pause in it, leaves the time.
   virtual void finalise(const SliceSequence& sequence) = 0;

@@ -25,7 +25,7 @@ struct PipelineOptions {
 
 /// Slices in, estimates out: the part that the live node and the offline replay share. Not thread-safe: one owner.
 ///
-/// For the same slices in the same order, poses and the final volume are the same bytes however the calls of
+/// With the budget "iterations", for the same slices in the same order, poses and the final volume are the same bytes however the calls of
 /// update_volume() fall between them (with the same number of threads).
 class LivePipeline {
  public:
@@ -42,6 +42,9 @@ class LivePipeline {
 
   /// Volume from the current poses. Does nothing (and returns false) if nothing was kept since the last one.
   bool update_volume();
+
+  /// Improves older poses by one step, if EstimatorOptions::budget is "time". @return false if there is nothing to gain
+  bool improve();
 
   /// Final poses and volume. Does nothing (and returns false) without slices, or if they are final already.
   bool finalise();

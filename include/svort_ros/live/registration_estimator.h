@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cstddef>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -11,9 +13,10 @@ namespace svort {
 /// Head motion without any trained weights: slices are registered to the volume that they form, the head's motion as
 /// one trajectory in acquisition order (see refine_poses), and the whole to a template, if there is one.
 ///
-/// add() takes the new slice's pose from the head's motion at its neighbour in time and refines all poses; finalise()
-/// refines from the coarsest level on, from these poses and from the scanner's, and keeps what fits better. Poses
-/// depend on the slices and their order alone.
+/// add() takes the new slice's pose from the head's motion at its neighbour in time and registers it, the newest slices
+/// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() refines all of them,
+/// from the coarsest level on, from these poses and from the scanner's, and keeps what fits better. Poses depend on the
+/// slices and their order alone.
 ///
 /// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
 /// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
@@ -26,6 +29,7 @@ class RegistrationEstimator : public IncrementalEstimator {
 
   void add(const SliceSequence& sequence) override;
   void update_volume(const SliceSequence& sequence) override;
+  bool improve(const SliceSequence& sequence) override;
   void finalise(const SliceSequence& sequence) override;
   void reset() override;
   const Estimate& estimate() const override { return estimate_; }
@@ -36,6 +40,10 @@ class RegistrationEstimator : public IncrementalEstimator {
   RegistrationInput input_of(const SliceSequence& sequence) const;
   std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
   void take(const SliceSequence& sequence, const Refinement& refinement, const std::vector<Pose>& before);
+  void add_incrementally(const SliceSequence& sequence, std::size_t position);
+  void take_incremental(const SliceSequence& sequence, std::size_t newest);
+  void take_uncertainty();
+  void tell_incremental(const SliceSequence& sequence);
   void align_to_template(const SliceSequence& sequence, const RegistrationInput& input);
   void move_frame(const Pose& T_new_old);
 
@@ -43,6 +51,9 @@ class RegistrationEstimator : public IncrementalEstimator {
   AcquisitionFormulation formulation_;
   ImageGrid grid_;
   std::vector<BrainTemplate> templates_;
+  std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
+  std::size_t idle_left_ = 0;                           ///< windows that improve() has not been at since the last slice
+  double idle_motion_mm_ = 0.;                          ///< largest mean motion of a window in this sweep of improve()
   Estimate estimate_;
   Volume volume_;
   bool aligned_ = false;           ///< the frame is the canonical one

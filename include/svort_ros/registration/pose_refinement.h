@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 #include <string>
 #include <vector>
 
@@ -57,6 +58,9 @@ struct RefinedSlice {
   double gain = 1.;    ///< slice = gain x simulated + offset
   double offset = 0.;
   std::string reason;  ///< why the weight is 0; empty otherwise
+  /// Expected error of the pose relative to the others (root mean square, rotations at the lever), mm, if the image's
+  /// noise is what is left of the differences and all else is right. It is not: see docs/live.md. NaN if unknown.
+  double sigma_mm = std::numeric_limits<double>::quiet_NaN();
 };
 
 struct RefinementReport {

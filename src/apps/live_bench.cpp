@@ -1,0 +1,178 @@
+#include "live_bench.h"
+
+#include <ATen/Parallel.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstdint>
+#include <iostream>
+#include <iterator>
+#include <stdexcept>
+
+#include "bench_support.h"
+#include "svort_ros/live/live_pipeline.h"
+#include "svort_ros/live/threads.h"
+#include "svort_ros/simulation/brain_volume.h"
+#include "svort_ros/simulation/scan_simulator.h"
+#include "svort_ros/simulation/scan_slices.h"
+
+namespace svort {
+
+const char* const kLiveBenchUsage =
+    "       svort_bench live [--slices N,..] [--stacks N] [--threads N] [--full N] [--volumes yes|no] [--seed N]\n"
+    "Feeds a simulated scan to the live pipeline (registration) and times each slice: arrival to pose (ms; median, 95 "
+    "%\n"
+    "quantile and largest since the first slice), the mean of the last 15, and arrival to volume.\n"
+    "  --slices   kept slices at which a line is printed, default 15,45,90,450\n"
+    "  --stacks   stacks per scan, 1 to 6, default 3; scans follow one another as stacks of one scan\n"
+    "  --threads  default: all cores\n"
+    "  --full     run the same with all slices registered again per arrival, up to so many slices; default 90\n"
+    "  --volumes  also estimate the volume after each slice, default yes\n"
+    "  --seed     of the simulated scan, default 1\n";
+
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+struct Options {
+  std::vector<std::int64_t> slices = {15, 45, 90, 450};
+  std::int64_t stacks = 3;
+  std::int64_t threads = at::get_num_threads();
+  std::int64_t full = 90;
+  bool volumes = true;
+  std::uint64_t seed = 1;
+};
+
+Options parse(const std::vector<std::string>& arguments) {
+  Options options;
+  for (std::size_t i = 0; i < arguments.size(); i += 2) {
+    const std::string& name = arguments[i];
+    if (i + 1 == arguments.size()) throw std::invalid_argument(name + " is unknown or needs a value");
+    const std::string& value = arguments[i + 1];
+    if (name == "--slices")
+      options.slices = positive_integers(name, value, 5000);
+    else if (name == "--stacks")
+      options.stacks = positive_integers(name, value, 6).front();
+    else if (name == "--threads")
+      options.threads = positive_integers(name, value, 1024).front();
+    else if (name == "--full")
+      options.full = positive_integers(name, value, 5000).front();
+    else if (name == "--seed")
+      options.seed = static_cast<std::uint64_t>(positive_integers(name, value, 1000000).front());
+    else if (name == "--volumes" && (value == "yes" || value == "no"))
+      options.volumes = value == "yes";
+    else
+      throw std::invalid_argument(name + " " + value + " is unknown");
+  }
+  std::sort(options.slices.begin(), options.slices.end());
+  return options;
+}
+
+/// Scans of one head (the built-in phantom), one after another, as stacks of one scan.
+class Slices {
+ public:
+  explicit Slices(const Options& options) : simulator_(simulator(options)) {}
+
+  Slice next() {
+    if (at_ == scan_.size()) {
+      const std::int64_t start_ns = scan_.empty() ? 1000000000 : scan_.back().info.stamp_ns + 10000000000;
+      const int first_stack = scan_.empty() ? 0 : scan_.back().info.stack + 1;
+      const SimulatedScan scan = simulator_.simulate(number_++, 1).front();
+      ScanSlicesOptions how;
+      how.scan_id = "benchmark";
+      how.start_ns = start_ns;
+      scan_.clear();
+      std::size_t i = 0;
+      for (Slice& slice : scan_slices(scan, how)) {
+        slice.info.stack += first_stack;
+        if (!scan.dropped[i++]) scan_.push_back(std::move(slice));
+      }
+      at_ = 0;
+    }
+    return scan_[at_++];
+  }
+
+ private:
+  static ScanSimulator simulator(const Options& options) {
+    SimulatorOptions how;
+    how.motion = "moderate";
+    how.size_px = 128;
+    how.resolution_mm = 1.;
+    how.prepared = false;
+    how.anatomies = how.scans_per_anatomy = 1;
+    how.scanner.stacks_min = how.scanner.stacks_max = static_cast<int>(options.stacks);
+    NetworkGrid grid;
+    grid.resolution_mm = 1.;
+    grid.volume_shape.fill(128);
+    return ScanSimulator({make_phantom({})}, grid, how, options.seed);
+  }
+
+  ScanSimulator simulator_;
+  std::uint64_t number_ = 0;
+  std::vector<Slice> scan_;
+  std::size_t at_ = 0;
+};
+
+double quantile(std::vector<double> values, double share) {
+  const auto rank = static_cast<std::ptrdiff_t>(std::ceil(share * static_cast<double>(values.size()))) - 1;
+  const auto nth = values.begin() + std::max<std::ptrdiff_t>(0, rank);
+  std::nth_element(values.begin(), nth, values.end());
+  return *nth;
+}
+
+double milliseconds_since(Clock::time_point start) {
+  return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+}
+
+/// @param baseline_ms of the other update at the same number of slices, mean of the last 15; empty: none
+/// @return mean of the last 15 at each entry of options.slices that was reached
+std::vector<double> run(const Options& options, const std::string& update, const std::vector<double>& baseline_ms) {
+  PipelineOptions pipeline_options;
+  pipeline_options.estimator.update = update;
+  LivePipeline pipeline(pipeline_options);
+  Slices slices(options);
+  std::vector<double> pose_ms, volume_ms, recent_means;
+  const bool full = update == "full";
+  const std::int64_t last = full ? std::min(options.full, options.slices.back()) : options.slices.back();
+  for (const std::int64_t count : options.slices) {
+    if (count > last) break;
+    while (static_cast<std::int64_t>(pose_ms.size()) < count) {
+      const Slice slice = slices.next();
+      const Clock::time_point arrived = Clock::now();
+      if (!is_kept(pipeline.add(slice).status)) continue;
+      pose_ms.push_back(milliseconds_since(arrived));
+      if (!options.volumes) continue;
+      pipeline.update_volume();
+      volume_ms.push_back(milliseconds_since(arrived));
+    }
+    const auto recent = pose_ms.end() - std::min<std::ptrdiff_t>(15, static_cast<std::ptrdiff_t>(pose_ms.size()));
+    double mean = 0.;
+    for (auto ms = recent; ms != pose_ms.end(); ++ms) mean += *ms / static_cast<double>(pose_ms.end() - recent);
+    recent_means.push_back(mean);
+    std::cout << R"({"benchmark": "live", "update": ")" << update << R"(", "slices": )" << count
+              << R"(, "stacks_per_scan": )" << options.stacks << R"(, "threads": )" << options.threads
+              << R"(, "pose_ms_median": )" << quantile(pose_ms, 0.5) << R"(, "pose_ms_p95": )"
+              << quantile(pose_ms, 0.95) << R"(, "pose_ms_max": )" << quantile(pose_ms, 1.)
+              << R"(, "pose_ms_last_15": )" << mean;
+    if (options.volumes)
+      std::cout << R"(, "volume_ms_median": )" << quantile(volume_ms, 0.5) << R"(, "volume_ms_p95": )"
+                << quantile(volume_ms, 0.95);
+    if (recent_means.size() <= baseline_ms.size())
+      std::cout << R"(, "full_over_this": )" << baseline_ms[recent_means.size() - 1] / mean;
+    std::cout << R"(, "peak_memory_mb": )" << peak_memory_mb() << R"(, "cpu": ")" << processor() << R"("})"
+              << std::endl;
+  }
+  return recent_means;
+}
+
+}  // namespace
+
+void run_live_bench(const std::vector<std::string>& arguments) {
+  const Options options = parse(arguments);
+  set_thread_count(static_cast<int>(options.threads));
+  const std::vector<double> full_ms = run(options, "full", {});
+  run(options, "incremental", full_ms);
+}
+
+}  // namespace svort
