@@ -4,7 +4,7 @@
 #include <cmath>
 #include <utility>
 
-#include "../acquisition/parallel.h"
+#include "../acquisition/psf_split.h"
 
 namespace svort {
 
@@ -24,45 +24,9 @@ std::vector<float> blurred(std::vector<float> values, int size, double sigma) {
   for (int i = 0; i <= radius; ++i)
     half[static_cast<std::size_t>(i)] = static_cast<float>(std::exp(-0.5 * i * i / (sigma * sigma)) / sum);
 
-  const std::int64_t n = size, plane = n * n;
-  std::vector<float> other(values.size());
-  // x, y and z pass alike: `stride` apart along the axis, whole rows of x at a time for y and z.
-  const auto pass = [&](const std::vector<float>& from, std::vector<float>& to, std::int64_t stride) {
-    parallel_chunks(n, [&](std::int64_t begin, std::int64_t end) {
-      for (std::int64_t z = begin; z < end; ++z) {
-        for (std::int64_t y = 0; y < n; ++y) {
-          const std::int64_t row = z * plane + y * n;
-          const std::int64_t along = stride == n ? y : z;
-          float* out = to.data() + row;
-          if (stride == 1) {
-            for (std::int64_t x = 0; x < n; ++x) {
-              float total = half[0] * from[static_cast<std::size_t>(row + x)];
-              for (std::int64_t i = 1; i <= radius; ++i) {
-                const float weight = half[static_cast<std::size_t>(i)];
-                if (x >= i) total += weight * from[static_cast<std::size_t>(row + x - i)];
-                if (x + i < n) total += weight * from[static_cast<std::size_t>(row + x + i)];
-              }
-              out[x] = total;
-            }
-            continue;
-          }
-          const float* in = from.data() + row;
-          for (std::int64_t x = 0; x < n; ++x) out[x] = half[0] * in[x];
-          for (std::int64_t i = 1; i <= radius; ++i) {
-            const float weight = half[static_cast<std::size_t>(i)];
-            if (along >= i)
-              for (std::int64_t x = 0; x < n; ++x) out[x] += weight * in[x - i * stride];
-            if (along + i < n)
-              for (std::int64_t x = 0; x < n; ++x) out[x] += weight * in[x + i * stride];
-          }
-        }
-      }
-    });
-  };
-  pass(values, other, 1);
-  pass(other, values, n);
-  pass(values, other, plane);
-  return other;
+  const std::int32_t n = size;
+  blur_volume(half, {n, n, n}, values.data(), values.data());
+  return values;
 }
 
 }  // namespace svort

@@ -117,6 +117,52 @@ TEST(RegistrationEstimator, FollowsTheHead) {
   }
 }
 
+TEST(RegistrationEstimator, RegistersAllSlicesAgainIfAskedTo) {
+  const Scan scan = moving_scan(2);
+  PipelineOptions options = quick_options();
+  options.estimator.update = "full";
+  LivePipeline full(options), incremental(quick_options());
+  const Poses a = run(full, scan, 0), b = run(incremental, scan, 0);
+  const double nominal = relative_error_mm(a.nominal, a.truth);
+  EXPECT_LT(relative_error_mm(a.estimated, a.truth), 0.6 * nominal);
+  EXPECT_LT(relative_error_mm(b.estimated, b.truth), 0.6 * nominal);
+  EXPECT_TRUE(full.estimate().slices.back().start.empty()) << "what only the incremental update knows";
+  EXPECT_FALSE(incremental.estimate().slices.back().start.empty());
+}
+
+TEST(RegistrationEstimator, ImprovesWhileNothingArrivesIfTimeIsTheBudget) {
+  const Scan scan = moving_scan(2);
+  PipelineOptions options = quick_options();
+  LivePipeline counted(options);
+  options.estimator.budget = "time";
+  LivePipeline timed(options);
+  for (const Slice& slice : scan.slices) {
+    counted.add(slice);
+    timed.add(slice);
+  }
+  EXPECT_FALSE(counted.improve()) << "poses must not depend on time";
+  const auto error = [&](const LivePipeline& pipeline) {
+    std::vector<Pose> poses, truth;
+    for (const SliceEstimate& slice : pipeline.estimate().slices) {
+      for (std::size_t i = 0; i < scan.slices.size(); ++i)
+        if (scan.slices[i].info.stamp_ns == slice.info.stamp_ns) truth.push_back(scan.truth[i]);
+      poses.push_back(slice.T_brain_slice);
+    }
+    return relative_error_mm(poses, truth);
+  };
+  EXPECT_EQ(error(counted), error(timed)) << "the same until there is time";
+  const double before = error(timed);
+  const std::uint64_t revision = timed.estimate().revision;
+  int steps = 0;
+  while (timed.improve() && steps < 1000) ++steps;
+  EXPECT_GT(steps, 3);
+  EXPECT_LT(steps, 1000) << "it comes to an end";
+  EXPECT_GT(timed.estimate().revision, revision);
+  EXPECT_LT(error(timed), 1.05 * before);
+  timed.finalise();
+  EXPECT_FALSE(timed.improve()) << "nothing is better than final";
+}
+
 TEST(RegistrationEstimator, FindsTheCanonicalFrameWithATemplate) {
   const Scan scan = moving_scan();
   LivePipeline pipeline(quick_options(), {phantom_template()});
@@ -178,6 +224,15 @@ TEST(RegistrationEstimator, StartsAnewAfterReset) {
 TEST(RegistrationEstimator, NamesTheOptionThatIsOutOfRange) {
   PipelineOptions options = quick_options();
   options.estimator.registration.lever_mm = -1.;
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+  options = quick_options();
+  options.estimator.incremental.window = 1;
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+  options = quick_options();
+  options.estimator.update = "sometimes";
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+  options = quick_options();
+  options.estimator.budget = "money";
   EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
   options = quick_options();
   options.estimator.template_match.refined = 0;

@@ -3,13 +3,17 @@
 #include <ATen/Parallel.h>
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <cmath>
 #include <cstdint>
+#include <iostream>
 #include <memory>
 #include <string>
 
 #include "golden_data.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/geometry/anchor_points.h"
+#include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/network/deterministic_weights.h"
 #include "svort_ros/network/svort.h"
 
@@ -218,6 +222,28 @@ TEST_P(GoldenSvort, MatchesRunningFree) {
   }
   attention.check(deviation(steps.back().attention, data.at("attn_last")).relative_l2, "attn_last");
   EXPECT_GE(volume.count(), 1);
+}
+
+// Not a comparison with golden numbers, but on their input: what the fast forward model changes in the answer.
+TEST_P(GoldenSvort, TheFastFormulationHardlyMovesThePoses) {
+  NetworkRun run = scan.run;
+  run.formulation = AcquisitionFormulation::exact;
+  const torch::Tensor exact = network(version()).run(scan.input, scan.grid, run).back().transforms;
+  run.formulation = AcquisitionFormulation::fast;
+  const torch::Tensor fast = network(version()).run(scan.input, scan.grid, run).back().transforms;
+  double worst_mm = 0., worst_deg = 0.;
+  for (std::int64_t i = 0; i < exact.size(0); ++i) {
+    const Pose moved = pose_from_tensor(fast[i]) * pose_from_tensor(exact[i]).inverse();
+    const Pose centre = pose_from_tensor(exact[i]);
+    worst_mm = std::max(worst_mm, (moved * centre.translation() - centre.translation()).norm());
+    worst_deg = std::max(worst_deg, rotation_angle(moved) * 180. / M_PI);
+  }
+  RecordProperty("worst_mm", std::to_string(worst_mm));
+  RecordProperty("worst_deg", std::to_string(worst_deg));
+  std::cout << "fast against exact, version " << version() << ": " << worst_mm << " mm, " << worst_deg << " degrees\n";
+  EXPECT_GT(worst_mm, 0.) << "the formulations must differ, or nothing is compared";
+  EXPECT_LT(worst_mm, 0.1);
+  EXPECT_LT(worst_deg, 0.1);
 }
 
 }  // namespace

@@ -151,10 +151,10 @@ TEST(IncrementalRefinement, SameBytesForAnyNumberOfThreads) {
   for (const int threads : {1, 2, 3}) {
     at::set_num_threads(threads);
     IncrementalRefinement refinement(quick_options(), {}, scan.input.resolution_mm, kFieldMm);
-    for (std::size_t i = 0; i < 24; ++i) feed(refinement, scan, i);
+    for (std::size_t i = 0; i < 20; ++i) feed(refinement, scan, i);
     found.push_back(poses_of(refinement));
   }
-  for (std::size_t i = 0; i < 24; ++i) {
+  for (std::size_t i = 0; i < 20; ++i) {
     EXPECT_EQ(found[0][i].matrix(), found[1][i].matrix());
     EXPECT_EQ(found[0][i].matrix(), found[2][i].matrix());
   }
