@@ -415,6 +415,17 @@ class IncrementalRefinement::Engine {
   /// From the terms of the last evaluate() of this window.
   void set_sigma(std::size_t begin, std::size_t end) {
     WindowSystem system = system_of(begin, end);
+    // How far the head goes from slice to slice just now, rather than what the solution expects of any head: one at
+    // rest leaves its slices little freedom, a restless one much.
+    double motion_mm = 0., steps = 0.;
+    for (std::size_t i = 0; i + 1 < system.motions.size(); ++i) {
+      const Pose step = system.motions[i + 1] * system.motions[i].inverse();
+      motion_mm += motion_size(twist_of(step), refinement_.lever_mm);
+      steps += 1.;
+    }
+    constexpr double kLeastStepMm = 0.1;
+    const double scale = std::max(kLeastStepMm, motion_mm / std::max(1., steps)) / refinement_.step_mm;
+    for (double& spread : system.spread_mm) spread *= scale;
     // Uncertain relative to the slices that are held; where none is, relative to the one in the middle.
     if (!system.held) system.terms[system.terms.size() / 2].hessian += system.stiffness;
     std::vector<Matrix6d> covariance;

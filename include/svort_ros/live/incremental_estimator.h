@@ -87,8 +87,8 @@ struct EstimatorOptions {
   std::string templates;  ///< folder of NIfTI brains in canonical orientation; empty: the frame has the scanner's axes
   std::string formulation = "fast";  ///< of the forward model; "exact" to match the public implementation to rounding
   /// SliceEstimate::radius_95_mm over what the registration's equations expect; calibrated, see docs/live.md.
-  double radius_factor = 1.;
-  double radius_factor_one_stack = 1.;  ///< the same, while there is one stack
+  double radius_factor = 1.2;
+  double radius_factor_one_stack = 2.5;  ///< the same, while there is one stack
   double volume_resolution_mm = 1.0;    ///< voxel size of the volume
   double volume_size_mm = 128.0;        ///< edge of the cube that is reconstructed, centred on the brain frame
   double recentre_mm = 10.0;            ///< the brain frame moves only when its centre is off by more than this
