@@ -52,7 +52,8 @@ std::size_t reference_of(const std::vector<SliceEstimate>& slices, double radius
 }
 
 double error_of(const SliceEstimate& slice, const MotionMonitorOptions& options) {
-  return is_outlier(slice) ? kNever : options.assumed_error_mm;
+  if (is_outlier(slice)) return kNever;
+  return std::isfinite(slice.radius_95_mm) ? slice.radius_95_mm : options.assumed_error_mm;
 }
 
 /// Rotation and shift of the brain's centre from a to b, in scanner axes.

@@ -18,16 +18,16 @@
 namespace svort {
 namespace {
 
-constexpr std::array<const char*, 24> kPoseColumns = {
-    "scan_id", "stack",   "slice",  "stamp",   "tx",      "ty",        "tz",      "qx",
-    "qy",      "qz",      "qw",     "head_tx", "head_ty", "head_tz",   "head_qx", "head_qy",
-    "head_qz", "head_qw", "weight", "ncc",     "status",  "displaced", "void",    "noisy"};
+constexpr std::array<const char*, 25> kPoseColumns = {
+    "scan_id", "stack", "slice",   "stamp",        "tx",        "ty",      "tz",      "qx",      "qy",
+    "qz",      "qw",    "head_tx", "head_ty",      "head_tz",   "head_qx", "head_qy", "head_qz", "head_qw",
+    "weight",  "ncc",   "status",  "radius_95_mm", "displaced", "void",    "noisy"};
 constexpr std::size_t kRequiredPoseColumns = 11;  // up to qw
-constexpr std::size_t kEstimateColumns = 21;      // the others are flags of truth.csv
+constexpr std::size_t kEstimateColumns = 22;      // the others are flags of truth.csv
 
 constexpr const char* kUpdateHeader =
     "stamp,stack,slice,sequence_length,revision,latency_ms,encoded,device,tx,ty,tz,qx,qy,qz,qw,status,reason,"
-    "volume_latency_ms,decision_latency_ms";
+    "volume_latency_ms,decision_latency_ms,start,radius_95_mm";
 
 /// One line of the table, with its fields by the name of their column.
 class RowReader {
@@ -133,7 +133,7 @@ void write_pose_table(const std::filesystem::path& path, const Estimate& estimat
     csv << field(slice.info.scan_id) << ',' << slice.info.stack << ',' << slice.info.index << ','
         << seconds(slice.info.stamp_ns) << ',' << pose_fields(slice.T_brain_slice) << ','
         << pose_fields(slice.T_scanner_brain) << ',' << number(slice.weight) << ',' << number(slice.ncc) << ','
-        << to_string(slice.status) << '\n';
+        << to_string(slice.status) << ',' << number(slice.radius_95_mm) << '\n';
   write_file(path, csv.str());
 }
 
@@ -175,6 +175,7 @@ std::vector<PoseRow> read_pose_table(const std::filesystem::path& path) {
     if (reader.has("weight")) row.weight = reader.value<double>("weight");
     if (reader.has("ncc")) row.ncc = reader.value<double>("ncc");
     if (reader.has("status")) row.status = reader.text("status");
+    if (reader.has("radius_95_mm")) row.radius_95_mm = reader.value<double>("radius_95_mm");
     for (auto [column, flag] : {std::pair{"displaced", &row.displaced}, {"void", &row.voided}, {"noisy", &row.noisy}})
       if (reader.has(column)) *flag = reader.flag(column);
     rows.push_back(row);
@@ -191,7 +192,8 @@ void write_update_table(const std::filesystem::path& path, const Journal& journa
         << entry.encoded << ',' << field(entry.device) << ','
         << (is_kept(entry.status) ? pose_fields(entry.T_brain_slice) : std::string("nan,nan,nan,nan,nan,nan,nan"))
         << ',' << to_string(entry.status) << ',' << field(entry.reason) << ',' << milliseconds(entry.volume_latency_ms)
-        << ',' << milliseconds(entry.decision_latency_ms) << '\n';
+        << ',' << milliseconds(entry.decision_latency_ms) << ',' << field(entry.start) << ','
+        << number(entry.radius_95_mm) << '\n';
   write_file(path, csv.str());
 }
 

@@ -42,6 +42,8 @@ svort::JournalEntry make_journal_entry(const svort::LivePipeline& pipeline, cons
     entry.revision = pipeline.estimate().revision;
     entry.encoded = pipeline.estimate().encoded;
     entry.T_brain_slice = pipeline.newest()->T_brain_slice;
+    entry.start = pipeline.newest()->start;
+    entry.radius_95_mm = pipeline.newest()->radius_95_mm;
   }
   return entry;
 }

@@ -254,6 +254,7 @@ SequenceEstimate to_msg(const svort::Estimate& estimate, const std::string& scan
     pose.scanner_from_brain = to_pose_msg(slice.T_scanner_brain);
     pose.weight = static_cast<float>(slice.weight);
     pose.ncc = static_cast<float>(slice.ncc);
+    pose.radius_95 = static_cast<float>(1e-3 * slice.radius_95_mm);
     switch (slice.status) {  // a new status must be given a code here
       case svort::PoseStatus::nominal:
         pose.status = SlicePose::NOMINAL;

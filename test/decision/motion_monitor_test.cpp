@@ -62,6 +62,20 @@ TEST(MotionMonitor, RestIsNoMotion) {
   }
 }
 
+TEST(MotionMonitor, TakesTheEstimatorsOwnErrorWhereThereIsOne) {
+  // The same half millimetre is motion if the poses are known to a tenth.
+  Estimate estimate = estimate_of(30, [](int i) { return head(i % 2 ? 0.25 : -0.25, 0.); });
+  for (SliceEstimate& slice : estimate.slices) slice.radius_95_mm = 0.1;
+  const MotionReport report = measure_motion(estimate, 0., {});
+  EXPECT_GT(report.window_displacement_mm, 0.2);
+  bool moved = false;
+  for (const HeadMotion& slice : report.slices) {
+    moved = moved || slice.moved;
+    EXPECT_LE(slice.error_mm, 0.1 * std::sqrt(2.) + 1e-12);
+  }
+  EXPECT_TRUE(moved);
+}
+
 TEST(MotionMonitor, MeasuresAStep) {
   // 6 mm and 0.1 rad between slices 14 and 15.
   const Estimate estimate = estimate_of(30, [](int i) { return i < 15 ? head(1., 0.) : head(7., 0.1); });

@@ -31,14 +31,15 @@ TEST_F(Tables, PosesAreExactlyAsDescribed) {
   slice.T_scanner_brain.linear() = Eigen::AngleAxisd(std::acos(-1.), Eigen::Vector3d::UnitX()).toRotationMatrix();
   slice.weight = 0.75;
   slice.ncc = kNan;
+  slice.radius_95_mm = 1.25;
   estimate.slices.push_back(slice);
   write_pose_table(path("poses.csv"), estimate);
   const std::string text = read(path("poses.csv"));
   EXPECT_EQ(text.substr(0, text.find('\n')),
             "scan_id,stack,slice,stamp,tx,ty,tz,qx,qy,qz,qw,head_tx,head_ty,head_tz,head_qx,head_qy,head_qz,head_qw,"
-            "weight,ncc,status");
+            "weight,ncc,status,radius_95_mm");
   EXPECT_TRUE(contains(text, "\na,1,4,1700000000.123456789,1.5,-2,0,0,0,0,1,0,0,0,1,")) << text;
-  EXPECT_TRUE(contains(text, ",0.75,nan,nominal\n")) << text;
+  EXPECT_TRUE(contains(text, ",0.75,nan,nominal,1.25\n")) << text;
 }
 
 TEST_F(Tables, PosesSurviveARoundTrip) {
@@ -151,17 +152,21 @@ TEST_F(Tables, UpdatesAreExactlyAsDescribed) {
   entry.decision_latency_ms = 7.5;
   entry.device = "cpu";
   entry.T_brain_slice.translation() << 1., 2., 3.;
+  entry.start = "prediction";
+  entry.radius_95_mm = 0.5;
   journal.add(entry);
+  entry.start = "";
+  entry.radius_95_mm = kNan;
   entry.status = ArrivalStatus::bad_image;
   entry.reason = "pixel is nan, must be \"finite\"";
   journal.add(entry);
   write_update_table(path("updates.csv"), journal);
   EXPECT_EQ(read(path("updates.csv")),
             "stamp,stack,slice,sequence_length,revision,latency_ms,encoded,device,tx,ty,tz,qx,qy,qz,qw,status,reason,"
-            "volume_latency_ms,decision_latency_ms\n"
-            "1.200000000,2,5,3,4,1.235,0,cpu,1,2,3,0,0,0,1,accepted,,nan,7.500\n"
+            "volume_latency_ms,decision_latency_ms,start,radius_95_mm\n"
+            "1.200000000,2,5,3,4,1.235,0,cpu,1,2,3,0,0,0,1,accepted,,nan,7.500,prediction,0.5\n"
             "1.200000000,2,5,3,4,1.235,0,cpu,nan,nan,nan,nan,nan,nan,nan,bad_image,"
-            "\"pixel is nan, must be \"\"finite\"\"\",nan,7.500\n");
+            "\"pixel is nan, must be \"\"finite\"\"\",nan,7.500,,nan\n");
 }
 
 TEST_F(Tables, NamesTheFileThatCannotBeWritten) {

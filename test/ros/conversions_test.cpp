@@ -313,6 +313,7 @@ TEST(EstimateConversion, KeepsPosesOrderAndNcc) {
     slice.T_scanner_brain = some_pose().inverse();
     slice.weight = 0.5;
     slice.ncc = i == 0 ? std::numeric_limits<double>::quiet_NaN() : 0.75;
+    if (i == 1) slice.radius_95_mm = 1.5;
     estimate.slices.push_back(slice);
   }
   const SequenceEstimate message = to_msg(estimate, "scanner", "fetal_brain");
@@ -324,6 +325,8 @@ TEST(EstimateConversion, KeepsPosesOrderAndNcc) {
   ASSERT_EQ(message.slices.size(), 3U);
   EXPECT_TRUE(std::isnan(message.slices[0].ncc));
   EXPECT_FLOAT_EQ(message.slices[1].ncc, 0.75F);
+  EXPECT_TRUE(std::isnan(message.slices[0].radius_95));
+  EXPECT_FLOAT_EQ(message.slices[1].radius_95, 0.0015F);
   EXPECT_FLOAT_EQ(message.slices[1].weight, 0.5F);
   EXPECT_EQ(message.slices[2].index, 4);
   EXPECT_EQ(message.slices[2].status, SlicePose::NOMINAL);

@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <filesystem>
+#include <limits>
 #include <string>
 #include <vector>
 
@@ -22,6 +23,7 @@ struct PoseRow {
   double weight = 1.;
   double ncc = 0.;
   std::string status;
+  double radius_95_mm = std::numeric_limits<double>::quiet_NaN();
   bool displaced = false;  ///< truth.csv: the head moved since the slice's stack was planned
   bool voided = false;     ///< truth.csv, column void: signal void
   bool noisy = false;      ///< truth.csv: much more noise than the other slices

@@ -25,6 +25,8 @@ struct JournalEntry {
   std::size_t encoded = 0;  ///< slices that a network encoded for this revision
   std::string device;
   Pose T_brain_slice = Pose::Identity();  ///< causal pose, mm; meaningless if the slice was rejected
+  std::string start;                      ///< SliceEstimate::start
+  double radius_95_mm = std::numeric_limits<double>::quiet_NaN();  ///< SliceEstimate::radius_95_mm, of the causal pose
 };
 
 /// The record of a scan: every arrival with its answer and its causal pose, in arrival order.
