@@ -21,8 +21,7 @@ endif()
 # Every library and program of this project finds its libraries relative to itself: the prefix can be moved.
 get_property(svort_targets DIRECTORY ${PROJECT_SOURCE_DIR} PROPERTY BUILDSYSTEM_TARGETS)
 set(svort_core_libraries svort_geometry svort_acquisition svort_reconstruction svort_network svort_sequence svort_live
-    svort_decision
-    svort_registration svort_simulation svort_metrics svort_training)
+    svort_decision svort_registration svort_simulation svort_metrics svort_evaluation svort_training)
 set(svort_other_libraries)
 set(svort_programs)
 foreach(target ${svort_targets})

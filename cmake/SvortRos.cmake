@@ -21,14 +21,14 @@ generate_messages(DEPENDENCIES geometry_msgs sensor_msgs std_msgs)
 catkin_package(
   INCLUDE_DIRS include
   LIBRARIES svort_geometry svort_acquisition svort_reconstruction svort_network svort_sequence
-            svort_registration svort_live svort_decision svort_simulation svort_metrics svort_io
+            svort_registration svort_live svort_decision svort_simulation svort_metrics svort_evaluation svort_io
             svort_ros_layer
             svort_nodelet
   CATKIN_DEPENDS diagnostic_updater dynamic_reconfigure geometry_msgs message_runtime nav_msgs nodelet pluginlib rosbag roscpp rosgraph_msgs
                  sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 
 svort_library(svort_io MODULE io
-  LINK svort_live svort_decision svort_simulation svort_metrics ${NIFTI_LIBRARY} ${ZNZ_LIBRARY} yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json
+  LINK svort_decision svort_evaluation ${NIFTI_LIBRARY} ${ZNZ_LIBRARY} yaml-cpp CLI11::CLI11 nlohmann_json::nlohmann_json
        opencv_core opencv_imgproc opencv_imgcodecs)
 target_include_directories(svort_io SYSTEM PRIVATE ${NIFTI_INCLUDE_DIR})
 target_compile_definitions(svort_io PRIVATE SVORT_VERSION="${PROJECT_VERSION}")
@@ -40,9 +40,10 @@ add_dependencies(svort_ros_layer ${PROJECT_NAME}_generate_messages_cpp)
 list(APPEND SVORT_LIBRARIES svort_io svort_ros_layer)
 
 # Programs and the nodelet's library, where rosrun, roslaunch and pluginlib look for them.
-foreach(program svort_node stack_player_node svort_replay nifti_to_bag svort_simulate svort_evaluate svort_calibrate)
+foreach(program svort_node stack_player_node svort_replay nifti_to_bag svort_simulate svort_evaluate svort_accuracy
+        svort_calibrate)
   add_executable(${program} src/apps/${program}.cpp)
-  if(program MATCHES "svort_(evaluate|calibrate)")
+  if(program MATCHES "svort_(evaluate|accuracy|calibrate)")
     target_link_libraries(${program} PRIVATE svort_io)
   else()
     target_link_libraries(${program} PRIVATE svort_ros_layer)

@@ -441,8 +441,9 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
     std::vector<cv::Point> line;
     for (const auto& [x, y] : curves[i].points)
       if (std::isfinite(x) && std::isfinite(y)) line.push_back(at(x, y));
-    cv::polylines(image, line, false, colour, 2, cv::LINE_AA);
-    if (line.size() == 1) draw_dot(image, line.front(), colour);
+    if (!curves[i].dots) cv::polylines(image, line, false, colour, 2, cv::LINE_AA);
+    if (curves[i].dots || line.size() == 1)
+      for (const cv::Point& point : line) draw_dot(image, point, colour);
     const std::string name = ascii(curves[i].name, 40);
     cv::line(image, {legend, 70}, {legend + 30, 70}, colour, 3);
     put_text(image, name, {legend + 38, 76}, 0.52, kInk);

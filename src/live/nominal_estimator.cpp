@@ -58,7 +58,7 @@ void NominalEstimator::update_volume(const SliceSequence& sequence) {
 }
 
 void NominalEstimator::finalise(const SliceSequence& sequence) {
-  volume_ = estimate_volume(sequence, grid_, formulation_, options_.final_cg_iterations, &estimate_.slices);
+  volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;
 }

@@ -9,7 +9,9 @@
 #include <stdexcept>
 #include <utility>
 
+#include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
+#include "svort_ros/registration/canonical_frame.h"
 
 namespace svort {
 namespace {
@@ -35,6 +37,10 @@ Pose best_fit(const std::vector<Pose>& from, const std::vector<Pose>& to, double
   return Pose(Eigen::umeyama(a, b, false));
 }
 
+double half_field_mm(const SliceSequence& sequence) {
+  return 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
+}
+
 }  // namespace
 
 RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates)
@@ -49,34 +55,6 @@ RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, st
     throw std::invalid_argument("estimator.budget is '" + options.budget + "'; known: iterations, time");
   formulation_ = acquisition_formulation(options.formulation);
   grid_ = volume_grid(options);
-}
-
-RegistrationInput RegistrationEstimator::input_of(const SliceSequence& sequence) const {
-  const auto& slices = sequence.slices();
-  const auto count = static_cast<std::int64_t>(slices.size());
-  const std::int64_t size = sequence.options().size_px;
-  const auto intensity = static_cast<float>(1. / sequence.intensity_scale());
-  RegistrationInput input;
-  input.slices = torch::empty({count, 1, size, size}, torch::kFloat32);
-  input.masks = torch::empty({count, 1, size, size}, torch::kBool);
-  input.resolution_mm = sequence.options().resolution_mm;
-  const auto plane = static_cast<std::size_t>(size * size);
-  // Nominal poses around the brain: the frame only has to be a fixed one near its centre.
-  const Eigen::Vector3d centre = slices.front()->info.T_scanner_slice.translation();
-  for (std::size_t i = 0; i < slices.size(); ++i) {
-    const PreparedSlice& slice = *slices[i];
-    std::transform(slice.pixels.begin(), slice.pixels.end(), input.slices.data_ptr<float>() + i * plane,
-                   [intensity](float value) { return value * intensity; });
-    std::transform(slice.mask.begin(), slice.mask.end(), input.masks.data_ptr<bool>() + i * plane,
-                   [](std::uint8_t value) { return value != 0; });
-    Pose nominal = slice.info.T_scanner_slice * slice.T_slice_crop;
-    nominal.translation() -= centre;
-    input.T_world_slice.push_back(nominal);
-    input.stack.push_back(slice.info.stack);
-    input.time_s.push_back(static_cast<double>(slice.info.stamp_ns - slices.front()->info.stamp_ns) * 1e-9);
-    input.thickness_mm.push_back(slice.info.thickness);
-  }
-  return input;
 }
 
 std::vector<Pose> RegistrationEstimator::crop_poses(const SliceSequence& sequence) const {
@@ -120,12 +98,13 @@ void RegistrationEstimator::add(const SliceSequence& sequence) {
     add_incrementally(sequence, position);
   } else if (slices.size() >= kFewestSlices) {
     const std::vector<Pose> start = crop_poses(sequence);
-    take(sequence, refine_poses(input_of(sequence), start, options_.registration, RefinementEffort::warm), start);
+    take(sequence, refine_poses(registration_input(sequence), start, options_.registration, RefinementEffort::warm),
+         start);
   }
   const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
   if (slices.size() >= kFewestForTemplate &&
       (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches))) {
-    align_to_template(sequence, input_of(sequence));
+    align_to_template(sequence, registration_input(sequence));
   }
   estimate_.scan_id = sequence.scan_id();
   estimate_.final = false;
@@ -235,8 +214,7 @@ void RegistrationEstimator::take(const SliceSequence& sequence, const Refinement
   // Registration sees relative motion only: the slices that were here hold the frame where it was.
   std::vector<Pose> after;
   for (const RefinedSlice& each : refinement.slices) after.push_back(each.T_brain_slice);
-  const double half_field = 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
-  const Pose held = best_fit(after, before, half_field);
+  const Pose held = best_fit(after, before, half_field_mm(sequence));
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
     SliceEstimate& slice = estimate_.slices[i];
     const RefinedSlice& refined = refinement.slices[i];
@@ -262,23 +240,14 @@ void RegistrationEstimator::move_frame(const Pose& T_new_old) {
 
 void RegistrationEstimator::align_to_template(const SliceSequence& sequence, const RegistrationInput& input) {
   aligned_count_ = estimate_.slices.size();
-  if (templates_.empty()) return;
-  const double voxel = options_.template_match.voxel_mm;
-  Volume rough;
-  rough.grid.size.setConstant(static_cast<int>(std::lround(options_.volume_size_mm / voxel)));
-  rough.grid.spacing.setConstant(voxel);
   std::vector<double> weights;
   for (const SliceEstimate& slice : estimate_.slices) weights.push_back(slice.weight);
-  const torch::Tensor volume = reconstruct_weighted(input, crop_poses(sequence), weights, rough.grid.size.x(), voxel);
-  rough.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
-  const double brain = brain_volume_mm3(rough);
-  if (!(brain > 0.)) return;
-  const BrainTemplate& nearest = templates_[nearest_templates(templates_, brain, 1).front()];
-  const TemplateMatch match = match_template(rough, nearest, options_.template_match);
-  if (!match.sure) return;
-  const bool small = rotation_angle(match.T_template_volume) < kFrameAngle &&
-                     match.T_template_volume.translation().norm() < kFrameShiftMm;
-  if (!aligned_ || !small) move_frame(match.T_template_volume);
+  const auto match = find_canonical_frame(input, crop_poses(sequence), weights, templates_, options_.volume_size_mm,
+                                          options_.template_match);
+  if (!match || !match->sure) return;
+  const bool small = rotation_angle(match->T_template_volume) < kFrameAngle &&
+                     match->T_template_volume.translation().norm() < kFrameShiftMm;
+  if (!aligned_ || !small) move_frame(match->T_template_volume);
   aligned_ = true;
 }
 
@@ -289,10 +258,10 @@ void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
 
 void RegistrationEstimator::finalise(const SliceSequence& sequence) {
   if (estimate_.slices.size() >= kFewestSlices) {
-    const RegistrationInput input = input_of(sequence);
+    const RegistrationInput input = registration_input(sequence);
     const std::vector<Pose> current = crop_poses(sequence);
     // From the scanner's poses as well: what was learnt on the way may have led astray.
-    const Pose T_brain_world = best_fit(input.T_world_slice, current, 64.);
+    const Pose T_brain_world = best_fit(input.T_world_slice, current, half_field_mm(sequence));
     std::vector<Pose> nominal;
     for (const Pose& pose : input.T_world_slice) nominal.push_back(T_brain_world * pose);
     const Refinement from_current = refine_poses(input, current, options_.registration);
@@ -306,7 +275,7 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
     }
     align_to_template(sequence, input);
   }
-  volume_ = estimate_volume(sequence, grid_, formulation_, options_.final_cg_iterations, &estimate_.slices);
+  volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;
 }

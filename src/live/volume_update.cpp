@@ -40,6 +40,31 @@ double masked_correlation(const float* a, const float* b, const bool* mask, cons
   return (n * sum_ab - sum_a * sum_b) / std::sqrt(variance);
 }
 
+SliceAcquisition acquisition_of(const SliceBatch& batch, const ImageGrid& grid, AcquisitionFormulation formulation) {
+  return SliceAcquisition(batch.geometry, static_cast<int>(batch.pixels.size(2)),
+                          static_cast<int>(batch.pixels.size(3)), {grid.size.z(), grid.size.y(), grid.size.x()},
+                          formulation, batch.masks);
+}
+
+/// Each slice's correlation with itself simulated from the volume.
+void set_correlations(const SliceBatch& batch, const SliceAcquisition& acquisition, const torch::Tensor& volume,
+                      std::vector<SliceEstimate>* slices) {
+  torch::Tensor coverage;
+  const torch::Tensor simulated = acquisition.forward(volume, &coverage);
+  const auto plane = static_cast<std::size_t>(batch.pixels.size(2) * batch.pixels.size(3));
+  for (std::size_t i = 0; i < slices->size(); ++i)
+    (*slices)[i].ncc = masked_correlation(
+        batch.pixels.data_ptr<float>() + i * plane, simulated.data_ptr<float>() + i * plane,
+        batch.masks.slices.data_ptr<bool>() + i * plane, coverage.data_ptr<float>() + i * plane, plane);
+}
+
+Volume volume_of(const torch::Tensor& values, const ImageGrid& grid) {
+  Volume result;
+  result.grid = grid;
+  result.values.assign(values.data_ptr<float>(), values.data_ptr<float>() + values.numel());
+  return result;
+}
+
 }  // namespace
 
 void validate(const EstimatorOptions& options) {
@@ -50,7 +75,9 @@ void validate(const EstimatorOptions& options) {
   require(options.recentre_mm >= 0. && std::isfinite(options.recentre_mm), "recentre_mm", options.recentre_mm,
           "zero or positive");
   require(options.cg_iterations >= 0, "cg_iterations", options.cg_iterations, "zero or positive");
-  require(options.final_cg_iterations >= 0, "final_cg_iterations", options.final_cg_iterations, "zero or positive");
+  validate(options.final_volume);
+  require(options.volume_size_mm >= 4. * options.final_volume.resolution_mm, "volume_size_mm", options.volume_size_mm,
+          "at least 4 voxels of the final volume");
   try {
     acquisition_formulation(options.formulation);
   } catch (const std::invalid_argument& error) {
@@ -69,10 +96,7 @@ Volume estimate_volume(const SliceSequence& sequence, const ImageGrid& grid, Acq
                        int cg_iterations, std::vector<SliceEstimate>* slices) {
   const torch::NoGradGuard no_grad;
   const SliceBatch batch = make_slice_batch(sequence, *slices, grid);
-  const auto height = static_cast<int>(batch.pixels.size(2));
-  const auto width = static_cast<int>(batch.pixels.size(3));
-  const SliceAcquisition acquisition(batch.geometry, height, width, {grid.size.z(), grid.size.y(), grid.size.x()},
-                                     formulation, batch.masks);
+  const SliceAcquisition acquisition = acquisition_of(batch, grid, formulation);
   torch::Tensor volume = reconstruct_psf(batch.pixels, acquisition, batch.weights);
   if (cg_iterations > 0) {
     ConjugateGradientOptions options;
@@ -80,18 +104,23 @@ Volume estimate_volume(const SliceSequence& sequence, const ImageGrid& grid, Acq
     volume = solve_weighted_inverse(batch.pixels, acquisition, batch.weights, volume, options);
   }
 
-  torch::Tensor coverage;
-  const torch::Tensor simulated = acquisition.forward(volume, &coverage);
-  const auto plane = static_cast<std::size_t>(height) * static_cast<std::size_t>(width);
-  for (std::size_t i = 0; i < slices->size(); ++i)
-    (*slices)[i].ncc = masked_correlation(
-        batch.pixels.data_ptr<float>() + i * plane, simulated.data_ptr<float>() + i * plane,
-        batch.masks.slices.data_ptr<bool>() + i * plane, coverage.data_ptr<float>() + i * plane, plane);
+  set_correlations(batch, acquisition, volume, slices);
+  return volume_of(volume, grid);
+}
 
-  Volume result;
-  result.grid = grid;
-  result.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
-  return result;
+Volume estimate_final_volume(const SliceSequence& sequence, const EstimatorOptions& options,
+                             std::vector<SliceEstimate>* slices) {
+  const torch::NoGradGuard no_grad;
+  EstimatorOptions final = options;
+  final.volume_resolution_mm = options.final_volume.resolution_mm;
+  const ImageGrid grid = volume_grid(final);
+  const SliceBatch batch = make_slice_batch(sequence, *slices, grid);
+  const SliceAcquisition acquisition = acquisition_of(batch, grid, acquisition_formulation(options.formulation));
+  const torch::Tensor volume = reconstruct_final_volume(batch.pixels, acquisition, batch.masks.slices, batch.weights,
+                                                        sequence.options().resolution_mm, options.final_volume)
+                                   .volume;
+  set_correlations(batch, acquisition, volume, slices);
+  return volume_of(volume, grid);
 }
 
 }  // namespace svort

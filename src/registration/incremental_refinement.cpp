@@ -290,7 +290,7 @@ class IncrementalRefinement::Engine {
   /// Independent measurements per pixel over the variance of the image's noise.
   double trust_of(double variance) const {
     const double noise = std::max(variance, 1e-6 * bright_ * bright_);
-    return options_.image_trust * (one_stack() ? refinement_.one_stack_trust : 1.) * pixel_mm_ * pixel_mm_ / noise;
+    return refinement_.image_trust * (one_stack() ? refinement_.one_stack_trust : 1.) * pixel_mm_ * pixel_mm_ / noise;
   }
 
   Vector6d bounded(const Vector6d& step) const {
@@ -539,8 +539,6 @@ void validate(const IncrementalOptions& options) {
   require(options.window >= 4 && options.window <= 1000, "window", options.window, "from 4 to 1000");
   require(options.passes >= 1 && options.passes <= 100, "passes", options.passes, "from 1 to 100");
   require(options.sweeps >= 0 && options.sweeps <= 1000, "sweeps", options.sweeps, "from 0 to 1000");
-  require(options.image_trust > 0. && options.image_trust <= 1., "image_trust", options.image_trust,
-          "above 0, at most 1");
   require(options.candidate_margin >= 0. && options.candidate_margin <= 2., "candidate_margin",
           options.candidate_margin, "from 0 to 2");
   require(options.moved_mm >= 0. && std::isfinite(options.moved_mm), "moved_mm", options.moved_mm, "zero or positive");

@@ -22,6 +22,7 @@
 #include "svort_ros/ros/bag.h"
 #include "svort_ros/ros/conversions.h"
 #include "svort_ros/ros/names.h"
+#include "svort_ros/simulation/scan_slices.h"
 
 namespace svort_ros {
 namespace {
@@ -29,38 +30,6 @@ namespace {
 namespace fs = std::filesystem;
 
 constexpr int kBadInput = 2;
-constexpr std::int64_t kStart_ns = 1000000000;  ///< as svort_replay stamps stacks by default
-constexpr double kBrightest = 1000.;            ///< value of the brightest tissue in the files
-
-std::int64_t stamp_ns(double time_s) { return kStart_ns + static_cast<std::int64_t>(std::llround(time_s * 1e9)); }
-
-/// The slices as a scanner would hand them out.
-std::vector<svort::Slice> slices_of(const svort::SimulatedScan& scan, const SimulateOptions& options) {
-  const torch::Tensor images = (scan.input.slices * kBrightest).to(torch::kCPU).contiguous();
-  const torch::Tensor masks = scan.masks.to(torch::kCPU, torch::kUInt8).contiguous();
-  const int size = options.simulator.size_px;
-  const auto plane = static_cast<std::size_t>(size) * static_cast<std::size_t>(size);
-  std::vector<svort::Slice> slices;
-  for (std::size_t i = 0; i < scan.plan.acquired.size(); ++i) {
-    const svort::PlannedSlice& planned = scan.plan.acquired[i];
-    svort::Slice slice;
-    slice.info.scan_id = options.scan_id;
-    slice.info.stack = planned.stack;
-    slice.info.index = planned.index;
-    slice.info.slices_in_stack = planned.slices_in_stack;
-    slice.info.stamp_ns = stamp_ns(planned.time_s);
-    slice.info.T_scanner_slice = planned.T_scanner_slice;
-    slice.info.pixel_spacing.setConstant(options.simulator.resolution_mm);
-    slice.info.thickness = scan.plan.thickness_mm;
-    slice.info.columns = slice.info.rows = size;
-    const float* pixels = images.data_ptr<float>() + i * plane;
-    const std::uint8_t* mask = masks.data_ptr<std::uint8_t>() + i * plane;
-    slice.pixels.assign(pixels, pixels + plane);
-    slice.mask.assign(mask, mask + plane);
-    slices.push_back(slice);
-  }
-  return slices;
-}
 
 /// A stack as a NIfTI volume; slices are counted along their normal.
 svort::Volume stack_volume(const std::vector<svort::Slice>& slices, int stack, double spacing_mm, bool mask) {
@@ -147,7 +116,9 @@ std::vector<std::string> simulate(const SimulateOptions& options) {
   grid.volume_shape.fill(simulator_options.size_px);
   svort::ScanSimulator simulator(brain_volumes(options), grid, simulator_options, options.seed);
   const svort::SimulatedScan scan = simulator.simulate(options.scan, 1)[0];
-  const std::vector<svort::Slice> slices = slices_of(scan, options);
+  svort::ScanSlicesOptions as_scanned;
+  as_scanned.scan_id = options.scan_id;
+  const std::vector<svort::Slice> slices = svort::scan_slices(scan, as_scanned);
 
   const fs::path folder = options.output;
   fs::create_directories(folder);

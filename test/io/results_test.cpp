@@ -19,7 +19,7 @@ PipelineOptions small_options() {
   options.estimator.method = "nominal";
   options.estimator.volume_resolution_mm = 2.;
   options.estimator.volume_size_mm = 60.;
-  options.estimator.final_cg_iterations = 1;
+  options.estimator.final_volume.resolution_mm = options.estimator.volume_resolution_mm;
   return options;
 }
 

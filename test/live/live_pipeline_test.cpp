@@ -21,7 +21,7 @@ PipelineOptions small_options() {
   options.estimator.method = "nominal";
   options.estimator.volume_resolution_mm = 2.;
   options.estimator.volume_size_mm = 96.;
-  options.estimator.final_cg_iterations = 3;
+  options.estimator.final_volume.resolution_mm = options.estimator.volume_resolution_mm;
   return options;
 }
 
@@ -209,8 +209,8 @@ TEST(MakeEstimator, NamesTheOptionThatIsWrong) {
   options.recentre_mm = -1.;
   EXPECT_NE(message(options).find("recentre_mm"), std::string::npos);
   options = {};
-  options.final_cg_iterations = -1;
-  EXPECT_NE(message(options).find("final_cg_iterations"), std::string::npos);
+  options.final_volume.passes = -1;
+  EXPECT_NE(message(options).find("final_volume.passes"), std::string::npos);
 }
 
 }  // namespace

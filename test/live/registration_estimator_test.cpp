@@ -23,6 +23,7 @@ PipelineOptions quick_options() {
   options.estimator.volume_resolution_mm = 2.;
   options.estimator.volume_size_mm = 96.;
   options.estimator.registration.finest_mm = 2.;
+  options.estimator.final_volume.resolution_mm = 2.;
   return options;
 }
 

@@ -216,8 +216,8 @@ TEST(IncrementalRefinement, NamesWhatIsOutOfRange) {
   options.window = 3;
   EXPECT_TRUE(rejected(options, "incremental.window"));
   options = {};
-  options.image_trust = 0.;
-  EXPECT_TRUE(rejected(options, "incremental.image_trust"));
+  options.sweeps = -1;
+  EXPECT_TRUE(rejected(options, "incremental.sweeps"));
   options = {};
   options.moved_mm = std::numeric_limits<double>::quiet_NaN();
   EXPECT_TRUE(rejected(options, "incremental.moved_mm"));

@@ -36,14 +36,14 @@ TEST(Parameters, AreReadFromTheirSections) {
   tree["node"]["scanner_frame"] = std::string("magnet");
   tree["sequence"]["margin_mm"] = 4;  // an integer for a floating-point option
   tree["sequence"]["intensity"]["quantile"] = 0.5;
-  tree["estimator"]["final_cg_iterations"] = 3;
+  tree["estimator"]["final_volume"]["passes"] = 3;
   tree["diagnostic_period"] = 2.0;  // not ours
   const ServerOptions options = read(tree);
   EXPECT_EQ(options.node.queue_size, 7);
   EXPECT_EQ(options.node.scanner_frame, "magnet");
   EXPECT_DOUBLE_EQ(options.pipeline.sequence.margin_mm, 4.);
   EXPECT_DOUBLE_EQ(options.pipeline.sequence.intensity.quantile, 0.5);
-  EXPECT_EQ(options.pipeline.estimator.final_cg_iterations, 3);
+  EXPECT_EQ(options.pipeline.estimator.final_volume.passes, 3);
   EXPECT_EQ(options.node.brain_frame, NodeOptions().brain_frame);  // not given: default
   EXPECT_EQ(read(XmlRpcValue()).node.queue_size, NodeOptions().queue_size);
 }

@@ -21,7 +21,8 @@ void plot_latency(const std::filesystem::path& path, const Journal& journal);
 /// One line of plot_curves(). Points that are not finite are left out.
 struct Curve {
   std::string name;
-  std::vector<std::pair<double, double>> points;  ///< x, y; x ascending
+  std::vector<std::pair<double, double>> points;  ///< x, y; x ascending for a line
+  bool dots = false;                              ///< single dots, not a line
 };
 
 /// The bytes of what plot_curves() writes. @throws std::runtime_error if it cannot be encoded

@@ -8,6 +8,7 @@
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/geometry/pose.h"
+#include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/registration/incremental_refinement.h"
 #include "svort_ros/registration/pose_refinement.h"
 #include "svort_ros/registration/template_registration.h"
@@ -89,16 +90,15 @@ struct EstimatorOptions {
   /// SliceEstimate::radius_95_mm over what the registration's equations expect; calibrated, see docs/live.md.
   double radius_factor = 1.2;
   double radius_factor_one_stack = 2.5;  ///< the same, while there is one stack
-  double volume_resolution_mm = 1.0;    ///< voxel size of the volume
-  double volume_size_mm = 128.0;        ///< edge of the cube that is reconstructed, centred on the brain frame
-  double recentre_mm = 10.0;            ///< the brain frame moves only when its centre is off by more than this
-  int cg_iterations = 0;                ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
-  /// The same, in finalise(). More sharpen the volume where poses are right, and fit noise and motion where not.
-  int final_cg_iterations = 2;
+  double volume_resolution_mm = 1.0;     ///< voxel size of the volume
+  double volume_size_mm = 128.0;         ///< edge of the cube that is reconstructed, centred on the brain frame
+  double recentre_mm = 10.0;             ///< the brain frame moves only when its centre is off by more than this
+  int cg_iterations = 0;                 ///< conjugate-gradient steps after the PSF reconstruction, while slices arrive
   NetworkEstimatorOptions network;
   RefinementOptions registration;
   IncrementalOptions incremental;
   TemplateOptions template_match;
+  FinalVolumeOptions final_volume;  ///< of finalise()
 
   template <class Visitor>
   void visit(Visitor&& v) {
@@ -113,11 +113,11 @@ struct EstimatorOptions {
     v("volume_size_mm", volume_size_mm, "edge of the reconstructed cube, mm");
     v("recentre_mm", recentre_mm, "the brain frame moves only when the brain's centre is off by more than this, mm");
     v("cg_iterations", cg_iterations, "conjugate-gradient steps per volume while slices arrive; 0: PSF reconstruction");
-    v("final_cg_iterations", final_cg_iterations, "conjugate-gradient steps of the final volume");
     v.section("network", network);
     v.section("registration", registration);
     v.section("incremental", incremental);
     v.section("template_match", template_match);
+    v.section("final_volume", final_volume);
   }
 };
 

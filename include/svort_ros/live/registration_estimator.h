@@ -37,7 +37,6 @@ class RegistrationEstimator : public IncrementalEstimator {
   std::string device() const override { return "cpu"; }
 
  private:
-  RegistrationInput input_of(const SliceSequence& sequence) const;
   std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
   void take(const SliceSequence& sequence, const Refinement& refinement, const std::vector<Pose>& before);
   void add_incrementally(const SliceSequence& sequence, std::size_t position);

@@ -25,4 +25,10 @@ ImageGrid volume_grid(const EstimatorOptions& options);
 Volume estimate_volume(const SliceSequence& sequence, const ImageGrid& grid, AcquisitionFormulation formulation,
                        int cg_iterations, std::vector<SliceEstimate>* slices);
 
+/// The final volume (see reconstruct_final_volume()) from the slices' current poses and weights, on the cube that the
+/// options ask for, at final_volume.resolution_mm; sets each slice's ncc.
+/// @throws std::invalid_argument if the counts differ or are zero
+Volume estimate_final_volume(const SliceSequence& sequence, const EstimatorOptions& options,
+                             std::vector<SliceEstimate>* slices);
+
 }  // namespace svort

@@ -17,7 +17,6 @@ struct IncrementalOptions {
   int window = 16;                 ///< slices that are registered together: the newest, and the sweep's
   int passes = 1;                  ///< times that the newest window is registered at each of its three levels of blur
   int sweeps = 1;                  ///< older windows that are registered again per arrival, one after another
-  double image_trust = 0.005;      ///< in place of RefinementOptions::image_trust: a causal pose has less to go by
   double candidate_margin = 0.02;  ///< a start other than the prediction must correlate better by this
   double moved_mm = 0.02;          ///< slices that moved less keep their terms in the volume, mm
 
@@ -26,7 +25,6 @@ struct IncrementalOptions {
     v("window", window, "slices that are registered together");
     v("passes", passes, "times that the newest window is registered at each level of blur");
     v("sweeps", sweeps, "older windows that are registered again per arrival");
-    v("image_trust", image_trust, "independent measurements per mm^2 of slice; lower it if poses follow noise");
     v("candidate_margin", candidate_margin, "a start other than the prediction must correlate better by this");
     v("moved_mm", moved_mm, "slices that moved less keep their terms in the volume, mm");
   }

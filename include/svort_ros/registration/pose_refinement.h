@@ -16,10 +16,10 @@ struct RefinementOptions {
   double stack_gap_factor = 3.;  ///< how much freer the head is between stacks than within; 0: stacks are independent
   double lever_mm = 40.;         ///< distance from the centre at which rotations are measured, about a head's radius
   double image_scale = 0.12;     ///< Cauchy scale of intensity differences, as part of the 0.99 quantile
-  double image_trust = 0.02;     ///< independent measurements per mm^2 of slice; lower it if poses follow noise
+  double image_trust = 0.005;    ///< independent measurements per mm^2 of slice; lower it if poses follow noise
   /// The same, as a factor, while there is one stack: its slices hardly overlap, and would gather where they look
   /// alike.
-  double one_stack_trust = 0.1;
+  double one_stack_trust = 0.4;
   double largest_step_mm = 3.;  ///< bound of one Gauss-Newton step of a slice
   double convergence_mm = 0.1;  ///< converged when the mean motion of the last pass is below this
   double outlier_ncc = 0.3;     ///< a slice that correlates less with the volume gets weight 0
