@@ -1,6 +1,8 @@
 #pragma once
 
 #include <gtest/gtest.h>
+#include <torch/ordered_dict.h>
+#include <torch/serialize.h>
 #include <torch/types.h>
 
 #include <algorithm>

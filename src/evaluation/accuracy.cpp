@@ -1,6 +1,6 @@
 #include "svort_ros/evaluation/accuracy.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <chrono>

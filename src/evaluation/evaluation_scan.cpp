@@ -1,6 +1,6 @@
 #include "svort_ros/evaluation/evaluation_scan.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <stdexcept>
 

@@ -163,8 +163,7 @@ void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std:
     before.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
     after.push_back(incremental_->slices()[i].T_brain_slice);
   }
-  const double half_field = 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
-  const Pose held = before.empty() ? Pose::Identity() : best_fit(after, before, half_field);
+  const Pose held = before.empty() ? Pose::Identity() : best_fit(after, before, half_field_mm(sequence));
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
     SliceEstimate& slice = estimate_.slices[i];
     const RefinedSlice& refined = incremental_->slices()[i];

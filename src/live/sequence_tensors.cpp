@@ -1,6 +1,6 @@
 #include "svort_ros/live/sequence_tensors.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <stdexcept>

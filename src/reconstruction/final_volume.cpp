@@ -1,6 +1,6 @@
 #include "svort_ros/reconstruction/final_volume.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <Eigen/Cholesky>
 #include <Eigen/Core>

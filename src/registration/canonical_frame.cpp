@@ -1,6 +1,6 @@
 #include "svort_ros/registration/canonical_frame.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 

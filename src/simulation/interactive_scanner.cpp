@@ -1,6 +1,6 @@
 #include "svort_ros/simulation/interactive_scanner.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <Eigen/Geometry>
 #include <algorithm>

@@ -1,6 +1,6 @@
 #include "svort_ros/simulation/scan_slices.h"
 
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 #include <stdexcept>

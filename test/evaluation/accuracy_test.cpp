@@ -1,7 +1,7 @@
 #include "svort_ros/evaluation/accuracy.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <cmath>
 #include <stdexcept>

@@ -1,6 +1,7 @@
 #include "svort_ros/network/checkpoint.h"
 
 #include <gtest/gtest.h>
+#include <torch/serialize.h>
 
 #include <cstdlib>
 #include <fstream>

@@ -1,6 +1,7 @@
 #include "svort_ros/network/network_runner.h"
 
 #include <gtest/gtest.h>
+#include <torch/cuda.h>
 
 #include <fstream>
 #include <limits>

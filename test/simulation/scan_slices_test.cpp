@@ -1,7 +1,7 @@
 #include "svort_ros/simulation/scan_slices.h"
 
 #include <gtest/gtest.h>
-#include <torch/torch.h>
+#include <torch/types.h>
 
 #include <stdexcept>
 
