@@ -19,6 +19,7 @@ namespace {
 constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to register to
 constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
 constexpr std::size_t kSlicesBetweenMatches = 15;
+constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
 /// The rigid motion that brings the planes `from` closest to `to`, by the corners of their fields.
@@ -150,7 +151,7 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   incremental_->refine_around(position);
   for (int i = 0; i < options_.incremental.sweeps; ++i) incremental_->sweep();
   take_incremental(sequence, position);
-  idle_left_ = incremental_->windows();
+  idle_left_ = kIdleSweeps * incremental_->windows();
   idle_motion_mm_ = 0.;
 }
 
@@ -199,10 +200,11 @@ void RegistrationEstimator::tell_incremental(const SliceSequence& sequence) {
 
 bool RegistrationEstimator::improve(const SliceSequence& sequence) {
   if (!incremental_ || options_.budget != "time" || idle_left_ == 0 || estimate_.final) return false;
+  const std::size_t windows = incremental_->windows();
   idle_motion_mm_ = std::max(idle_motion_mm_, incremental_->sweep());
-  // A whole sweep that still moved something is worth another one.
-  if (--idle_left_ == 0 && std::exchange(idle_motion_mm_, 0.) > options_.registration.convergence_mm)
-    idle_left_ = incremental_->windows();
+  // After a whole sweep that moved nothing there is nothing to gain.
+  if (--idle_left_ % windows == 0 && std::exchange(idle_motion_mm_, 0.) <= options_.registration.convergence_mm)
+    idle_left_ = 0;
   take_incremental(sequence, estimate_.slices.size());
   ++estimate_.revision;
   return idle_left_ > 0;

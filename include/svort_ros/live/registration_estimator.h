@@ -51,8 +51,8 @@ class RegistrationEstimator : public IncrementalEstimator {
   ImageGrid grid_;
   std::vector<BrainTemplate> templates_;
   std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
-  std::size_t idle_left_ = 0;                           ///< windows that improve() has not been at since the last slice
-  double idle_motion_mm_ = 0.;                          ///< largest mean motion of a window in this sweep of improve()
+  std::size_t idle_left_ = 0;   ///< windows that improve() may still register again before the next slice
+  double idle_motion_mm_ = 0.;  ///< largest mean motion of a window in this sweep of improve()
   Estimate estimate_;
   Volume volume_;
   bool aligned_ = false;           ///< the frame is the canonical one
