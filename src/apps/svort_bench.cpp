@@ -69,7 +69,8 @@ struct Options {
 constexpr int kSize = 128;  // pixels along each side of a slice
 
 Options parse(const std::vector<std::string>& arguments) {
-  if (arguments.empty() || arguments[0] != "forward") throw UsageError("the first argument must be forward, network or live");
+  if (arguments.empty() || arguments[0] != "forward")
+    throw UsageError("the first argument must be forward, network or live");
   Options options;
   for (std::size_t i = 1; i < arguments.size(); i += 2) {
     const std::string& name = arguments[i];

@@ -25,8 +25,8 @@ struct PipelineOptions {
 
 /// Slices in, estimates out: the part that the live node and the offline replay share. Not thread-safe: one owner.
 ///
-/// With the budget "iterations", for the same slices in the same order, poses and the final volume are the same bytes however the calls of
-/// update_volume() fall between them (with the same number of threads).
+/// With the budget "iterations", for the same slices in the same order, poses and the final volume are the same bytes
+/// however the calls of update_volume() fall between them (with the same number of threads).
 class LivePipeline {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
