@@ -2,8 +2,10 @@
 
 find_program(CCACHE_PROGRAM ccache)
 if(CCACHE_PROGRAM AND NOT CMAKE_CXX_COMPILER_LAUNCHER)
-  # Without these, ccache does not keep what was compiled with precompiled headers.
-  set(CMAKE_CXX_COMPILER_LAUNCHER ${CMAKE_COMMAND} -E env CCACHE_SLOPPINESS=pch_defines,time_macros ${CCACHE_PROGRAM})
+  # Without these, ccache does not keep what was compiled with precompiled headers, or not for other folders: the compiled
+  # header is never the same twice, so ccache looks at the file beside it (svort_precompile_headers) instead.
+  set(CMAKE_CXX_COMPILER_LAUNCHER ${CMAKE_COMMAND} -E env CCACHE_SLOPPINESS=pch_defines,time_macros
+                                  CCACHE_PCH_EXTSUM=true ${CCACHE_PROGRAM})
 endif()
 
 # Warnings and sanitizers of this project's own targets.
@@ -36,6 +38,11 @@ function(svort_precompile_headers target owner)
   endif()
   if(target STREQUAL owner)
     target_precompile_headers(${target} PRIVATE ${svort_precompiled_headers} ${ARGN})
+    # What the compiled header depends on, for ccache.
+    get_target_property(folder ${target} BINARY_DIR)
+    file(GENERATE OUTPUT ${folder}/CMakeFiles/${target}.dir/cmake_pch.hxx.gch.sum CONTENT
+      "${svort_precompiled_headers} ${ARGN}\n${CMAKE_CXX_COMPILER_ID} ${CMAKE_CXX_COMPILER_VERSION}\nTorch ${Torch_VERSION} \
+Eigen ${EIGEN3_VERSION_STRING} GTest ${GTest_VERSION}\n${CMAKE_BUILD_TYPE} ${CMAKE_CXX_FLAGS} ${SVORT_SANITIZE}\n")
   else()
     target_precompile_headers(${target} REUSE_FROM ${owner})
   endif()
