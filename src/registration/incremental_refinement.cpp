@@ -153,12 +153,13 @@ class IncrementalRefinement::Engine {
     const auto window = static_cast<std::size_t>(options_.window);
     for (std::size_t begin = 0; begin < n; begin += window / 2) {
       const std::size_t end = std::min(n, begin + window);
-      const std::vector<RefinedSlice> as_they_are = slices_;
+      const std::vector<RefinedSlice> as_they_are(slices_.begin() + static_cast<std::ptrdiff_t>(begin),
+                                                  slices_.begin() + static_cast<std::ptrdiff_t>(end));
       evaluate(begin, end, kLevels - 1);
       set_sigma(begin, end);
       for (std::size_t i = begin; i < end; ++i) {
         const double sigma_mm = slices_[i].sigma_mm;
-        slices_[i] = as_they_are[i];
+        slices_[i] = as_they_are[i - begin];
         slices_[i].sigma_mm = sigma_mm;
       }
     }
@@ -217,6 +218,7 @@ class IncrementalRefinement::Engine {
         kept.in_volume = false;
         --in_volume_;
         ++replaced_;
+        forget_volumes();
       }
       if (weight > 0.) {
         acquisition_of(kept, pose).add_to_sums(kept.pixels, weight, &sums_);
@@ -224,8 +226,8 @@ class IncrementalRefinement::Engine {
         kept.volume_pose = pose;
         kept.volume_weight = weight;
         ++in_volume_;
+        forget_volumes();
       }
-      forget_volumes();
     }
   }
 

@@ -37,7 +37,7 @@ struct SliceEstimate {
   double ncc = 0.;
   PoseStatus status = PoseStatus::nominal;
   std::string reason;  ///< why the weight is 0; empty otherwise
-  /// What the slice was first registered from: "prediction", "nominal" or "network". Empty: it was not.
+  /// What the slice was first registered from: "prediction", "stack begin" or "scan begin". Empty: it was not.
   std::string start;
   /// 95 % of slices lie closer to their true place than this, relative to the others (root mean square over the head),
   /// mm; see docs/live.md for how it is calibrated. NaN while unknown.

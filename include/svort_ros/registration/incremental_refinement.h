@@ -44,7 +44,7 @@ struct IncrementalSlice {
 
 /// Where a new slice may be.
 struct PoseCandidate {
-  std::string name;  ///< for the records: "prediction", "nominal", "network"
+  std::string name;  ///< for the records, e.g. "prediction"
   Pose T_brain_slice = Pose::Identity();
 };
 
