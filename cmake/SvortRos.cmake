@@ -53,13 +53,6 @@ foreach(program svort_node stack_player_node svort_replay nifti_to_bag svort_sim
     RUNTIME_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_BIN_DESTINATION})
 endforeach()
 
-# Needs no ROS, only what the files need.
-add_executable(svort_train src/apps/svort_train.cpp)
-target_link_libraries(svort_train PRIVATE svort_training svort_io)
-svort_target_options(svort_train)
-set_target_properties(svort_train PROPERTIES
-  RUNTIME_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_BIN_DESTINATION})
-
 add_library(svort_nodelet SHARED src/apps/svort_nodelet.cpp)
 target_link_libraries(svort_nodelet PUBLIC svort_ros_layer)
 svort_target_options(svort_nodelet)

@@ -20,6 +20,7 @@ EvaluationScan simulate_evaluation_scan(const BrainVolume& brain, const Evaluati
   simulator.prepared = false;
   simulator.anatomies = simulator.scans_per_anatomy = 1;
   simulator.anatomy = no_anatomy_variation();
+  simulator.scanner.protocol = options.protocol;
   simulator.scanner.stacks_min = simulator.scanner.stacks_max = kStacks;
   if (options.damaged_masks) {
     simulator.artifacts.mask_lost_share = 0.15;

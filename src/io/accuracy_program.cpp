@@ -4,11 +4,10 @@
 #include <cstdio>
 #include <exception>
 #include <map>
-#include <set>
 #include <sstream>
 #include <stdexcept>
-#include <tuple>
 
+#include "accuracy_columns.h"
 #include "svort_ros/evaluation/left_out.h"
 #include "svort_ros/io/accuracy_table.h"
 #include "svort_ros/io/atomic_file.h"
@@ -75,9 +74,6 @@ std::string three_digits(double value) {
   return std::isfinite(value) ? text : "-";
 }
 
-using Key = std::tuple<std::string, std::string, std::uint64_t, std::string, int, std::string>;
-Key key_of(const AccuracyRow& row) { return {row.brain, row.motion, row.number, row.masks, row.stacks, row.method}; }
-
 fs::path volume_file(const fs::path& folder, const std::string& name) {
   for (const char* ending : {".nii.gz", ".nii"})
     if (fs::exists(folder / (name + ending))) return folder / (name + ending);
@@ -88,14 +84,13 @@ void measure(const Plan& plan) {
   set_thread_count(plan.threads);
   fs::create_directories(plan.output);
   const fs::path csv = fs::path(plan.output) / "accuracy.csv";
-  std::vector<AccuracyRow> rows = read_accuracy_rows(csv);
-  std::set<Key> done;
-  for (const AccuracyRow& row : rows) done.insert(key_of(row));
-  const std::vector<Task> tasks = all_tasks(plan);
-  const auto wanted = [&](const Task& task) {
-    return plan.methods.empty() ||
-           std::find(plan.methods.begin(), plan.methods.end(), task.method.name) != plan.methods.end();
+  RowStore<AccuracyRow> store(csv, accuracy_columns());
+  std::vector<Task> tasks = all_tasks(plan);
+  const auto unwanted = [&](const Task& task) {
+    return !plan.methods.empty() &&
+           std::find(plan.methods.begin(), plan.methods.end(), task.method.name) == plan.methods.end();
   };
+  tasks.erase(std::remove_if(tasks.begin(), tasks.end(), unwanted), tasks.end());
 
   AccuracySetup setup;
   setup.pipeline = plan.pipeline;
@@ -111,13 +106,13 @@ void measure(const Plan& plan) {
     brains.push_back(read_brain_volume(volume_file(plan.brains, name), fs::exists(mask) ? mask : fs::path()));
     brains.back().name = name;
   }
+  TaskClock clock(static_cast<std::size_t>(plan.scans) * plan.motions.size() * brains.size() * tasks.size());
   // Scan by scan over all classes and brains, so that a table of few scans is already a fair one.
   for (int scan = 0; scan < plan.scans; ++scan)
     for (const std::string& motion : plan.motions)
       for (std::size_t b = 0; b < brains.size(); ++b) {
         std::map<std::pair<bool, int>, EvaluationScan> simulated;
         for (const Task& task : tasks) {
-          if (!wanted(task)) continue;
           EvaluationScanOptions options;
           options.motion = motion;
           options.stacks = task.stacks;
@@ -131,7 +126,10 @@ void measure(const Plan& plan) {
           row.masks = task.damaged_masks ? "damaged" : "usual";
           row.stacks = task.stacks;
           row.method = task.method.name;
-          if (done.count(key_of(row))) continue;
+          if (store.has(row)) {
+            clock.skip();
+            continue;
+          }
           auto found = simulated.find({task.damaged_masks, task.stacks});
           if (found == simulated.end())
             found =
@@ -139,19 +137,17 @@ void measure(const Plan& plan) {
                     .emplace(std::pair{task.damaged_masks, task.stacks}, simulate_evaluation_scan(brains[b], options))
                     .first;
           row = measure_accuracy(found->second, task.method, setup);
-          rows.push_back(row);
-          done.insert(key_of(row));
-          write_accuracy_rows(csv, rows);
-          write_file(fs::path(plan.output) / "accuracy.md", accuracy_markdown(rows));
-          plot_accuracy(fs::path(plan.output) / "accuracy.png", rows);
+          store.add({row});
+          write_file(fs::path(plan.output) / "accuracy.md", accuracy_markdown(store.rows()));
+          plot_accuracy(fs::path(plan.output) / "accuracy.png", store.rows());
           std::fprintf(stderr,
                        "%s %-8s %2d %-7s %d %-28s rel ED %6.2f (%5.2f) GD %5.3f  ED %6.2f %6.2f frame %4.2f %4.2f  "
-                       "psnr %5.2f %5.2f ssim %5.3f %5.3f  %5.1f s %4.0f ms%s\n",
+                       "psnr %5.2f %5.2f ssim %5.3f %5.3f  %5.1f s %4.0f ms%s (%s)\n",
                        row.brain.c_str(), row.motion.c_str(), static_cast<int>(row.number), row.masks.c_str(),
                        row.stacks, row.method.c_str(), row.relative_ed_mm, row.relative_median_ed_mm,
                        row.relative_gd_rad, row.atlas.ed_mm, row.shipped.ed_mm, row.atlas.frame_rad,
                        row.shipped.frame_rad, row.psf.psnr_db, row.final.psnr_db, row.psf.ssim, row.final.ssim,
-                       row.seconds, row.p95_ms, row.converged ? "" : " not converged");
+                       row.seconds, row.p95_ms, row.converged ? "" : " not converged", clock.next().c_str());
         }
       }
 }

@@ -1,143 +1,19 @@
 #include "svort_ros/io/accuracy_table.h"
 
 #include <algorithm>
-#include <array>
-#include <charconv>
 #include <cmath>
-#include <cstdio>
-#include <fstream>
-#include <functional>
 #include <limits>
 #include <map>
 #include <numeric>
 #include <sstream>
-#include <stdexcept>
 #include <tuple>
-#include <type_traits>
 #include <utility>
 
-#include "svort_ros/io/atomic_file.h"
+#include "accuracy_columns.h"
 #include "svort_ros/io/plots.h"
 
 namespace svort {
 namespace {
-
-struct Column {
-  const char* name;
-  std::function<std::string(const AccuracyRow&)> text;
-  std::function<void(AccuracyRow&, const std::string&)> set;
-};
-
-std::string text_of(double value) {
-  std::array<char, 32> buffer{};
-  const auto end = std::to_chars(buffer.data(), buffer.data() + buffer.size(), value, std::chars_format::general, 9);
-  return std::string(buffer.data(), end.ptr);
-}
-
-template <class Number>
-Number number_of(const std::string& text) {
-  if constexpr (std::is_floating_point_v<Number>) {
-    if (text == "nan" || text == "-nan") return std::numeric_limits<Number>::quiet_NaN();
-  }
-  Number value{};
-  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
-  if (error != std::errc() || end != text.data() + text.size())
-    throw std::invalid_argument("'" + text + "' is not a number");
-  return value;
-}
-
-template <class Member>
-Column word(const char* name, Member member) {
-  return {name, [member](const AccuracyRow& row) { return row.*member; },
-          [member](AccuracyRow& row, const std::string& text) { row.*member = text; }};
-}
-
-/// @param member reference to the number of a row: AccuracyRow& -> Number&
-template <class Access>
-Column number(const char* name, Access access) {
-  return {name,
-          [access](const AccuracyRow& row) {
-            AccuracyRow copy = row;
-            if constexpr (std::is_floating_point_v<std::decay_t<decltype(access(copy))>>)
-              return text_of(access(copy));
-            else
-              return std::to_string(access(copy));
-          },
-          [access](AccuracyRow& row, const std::string& text) {
-            auto& value = access(row);
-            using Number = std::decay_t<decltype(value)>;
-            if constexpr (std::is_same_v<Number, bool>)
-              value = number_of<int>(text) != 0;
-            else
-              value = number_of<Number>(text);
-          }};
-}
-
-const std::vector<Column>& columns() {
-  static const std::vector<Column> all = [] {
-    std::vector<Column> list;
-    list.push_back(word("brain", &AccuracyRow::brain));
-    list.push_back(word("motion", &AccuracyRow::motion));
-    list.push_back(number(
-        "scan", [](AccuracyRow & r) -> auto& { return r.number; }));
-    list.push_back(word("masks", &AccuracyRow::masks));
-    list.push_back(number(
-        "stacks", [](AccuracyRow & r) -> auto& { return r.stacks; }));
-    list.push_back(word("method", &AccuracyRow::method));
-    list.push_back(number(
-        "slices", [](AccuracyRow & r) -> auto& { return r.slices; }));
-    list.push_back(number(
-        "relative_ed_mm", [](AccuracyRow & r) -> auto& { return r.relative_ed_mm; }));
-    list.push_back(number(
-        "relative_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.relative_median_ed_mm; }));
-    list.push_back(number(
-        "relative_gd_rad", [](AccuracyRow & r) -> auto& { return r.relative_gd_rad; }));
-    list.push_back(number(
-        "atlas_ed_mm", [](AccuracyRow & r) -> auto& { return r.atlas.ed_mm; }));
-    list.push_back(number(
-        "atlas_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.atlas.median_ed_mm; }));
-    list.push_back(number(
-        "atlas_gd_rad", [](AccuracyRow & r) -> auto& { return r.atlas.gd_rad; }));
-    list.push_back(number(
-        "atlas_frame_rad", [](AccuracyRow & r) -> auto& { return r.atlas.frame_rad; }));
-    list.push_back(number(
-        "atlas_sure", [](AccuracyRow & r) -> auto& { return r.atlas.sure; }));
-    list.push_back(number(
-        "shipped_ed_mm", [](AccuracyRow & r) -> auto& { return r.shipped.ed_mm; }));
-    list.push_back(number(
-        "shipped_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.shipped.median_ed_mm; }));
-    list.push_back(number(
-        "shipped_gd_rad", [](AccuracyRow & r) -> auto& { return r.shipped.gd_rad; }));
-    list.push_back(number(
-        "shipped_frame_rad", [](AccuracyRow & r) -> auto& { return r.shipped.frame_rad; }));
-    list.push_back(number(
-        "shipped_sure", [](AccuracyRow & r) -> auto& { return r.shipped.sure; }));
-    list.push_back(number(
-        "psf_psnr_db", [](AccuracyRow & r) -> auto& { return r.psf.psnr_db; }));
-    list.push_back(number(
-        "psf_ssim", [](AccuracyRow & r) -> auto& { return r.psf.ssim; }));
-    list.push_back(number(
-        "final_psnr_db", [](AccuracyRow & r) -> auto& { return r.final.psnr_db; }));
-    list.push_back(number(
-        "final_ssim", [](AccuracyRow & r) -> auto& { return r.final.ssim; }));
-    list.push_back(number(
-        "converged", [](AccuracyRow & r) -> auto& { return r.converged; }));
-    list.push_back(number(
-        "seconds", [](AccuracyRow & r) -> auto& { return r.seconds; }));
-    list.push_back(number(
-        "p95_ms", [](AccuracyRow & r) -> auto& { return r.p95_ms; }));
-    return list;
-  }();
-  return all;
-}
-
-std::string fixed(double value, int decimals) {
-  if (!std::isfinite(value)) return "-";
-  std::array<char, 64> buffer{};
-  const auto end =
-      std::to_chars(buffer.data(), buffer.data() + buffer.size(), value, std::chars_format::fixed, decimals);
-  return std::string(buffer.data(), end.ptr);
-}
 
 /// Rows of one method in one motion class; NaN is left out.
 class Group {
@@ -192,43 +68,77 @@ class Group {
 
 }  // namespace
 
+const std::vector<CsvColumn<AccuracyRow>>& accuracy_columns() {
+  static const std::vector<CsvColumn<AccuracyRow>> all = [] {
+    std::vector<CsvColumn<AccuracyRow>> list;
+    const auto add = [&list](const char* name, auto access, bool key = false) {
+      list.push_back(csv_column<AccuracyRow>(name, access, key));
+    };
+    add(
+        "brain", [](AccuracyRow & r) -> auto& { return r.brain; }, true);
+    add(
+        "motion", [](AccuracyRow & r) -> auto& { return r.motion; }, true);
+    add(
+        "scan", [](AccuracyRow & r) -> auto& { return r.number; }, true);
+    add(
+        "masks", [](AccuracyRow & r) -> auto& { return r.masks; }, true);
+    add(
+        "stacks", [](AccuracyRow & r) -> auto& { return r.stacks; }, true);
+    add(
+        "method", [](AccuracyRow & r) -> auto& { return r.method; }, true);
+    add(
+        "slices", [](AccuracyRow & r) -> auto& { return r.slices; });
+    add(
+        "relative_ed_mm", [](AccuracyRow & r) -> auto& { return r.relative_ed_mm; });
+    add(
+        "relative_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.relative_median_ed_mm; });
+    add(
+        "relative_gd_rad", [](AccuracyRow & r) -> auto& { return r.relative_gd_rad; });
+    add(
+        "atlas_ed_mm", [](AccuracyRow & r) -> auto& { return r.atlas.ed_mm; });
+    add(
+        "atlas_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.atlas.median_ed_mm; });
+    add(
+        "atlas_gd_rad", [](AccuracyRow & r) -> auto& { return r.atlas.gd_rad; });
+    add(
+        "atlas_frame_rad", [](AccuracyRow & r) -> auto& { return r.atlas.frame_rad; });
+    add(
+        "atlas_sure", [](AccuracyRow & r) -> auto& { return r.atlas.sure; });
+    add(
+        "shipped_ed_mm", [](AccuracyRow & r) -> auto& { return r.shipped.ed_mm; });
+    add(
+        "shipped_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.shipped.median_ed_mm; });
+    add(
+        "shipped_gd_rad", [](AccuracyRow & r) -> auto& { return r.shipped.gd_rad; });
+    add(
+        "shipped_frame_rad", [](AccuracyRow & r) -> auto& { return r.shipped.frame_rad; });
+    add(
+        "shipped_sure", [](AccuracyRow & r) -> auto& { return r.shipped.sure; });
+    add(
+        "psf_psnr_db", [](AccuracyRow & r) -> auto& { return r.psf.psnr_db; });
+    add(
+        "psf_ssim", [](AccuracyRow & r) -> auto& { return r.psf.ssim; });
+    add(
+        "final_psnr_db", [](AccuracyRow & r) -> auto& { return r.final.psnr_db; });
+    add(
+        "final_ssim", [](AccuracyRow & r) -> auto& { return r.final.ssim; });
+    add(
+        "converged", [](AccuracyRow & r) -> auto& { return r.converged; });
+    add(
+        "seconds", [](AccuracyRow & r) -> auto& { return r.seconds; });
+    add(
+        "p95_ms", [](AccuracyRow & r) -> auto& { return r.p95_ms; });
+    return list;
+  }();
+  return all;
+}
+
 std::vector<AccuracyRow> read_accuracy_rows(const std::filesystem::path& path) {
-  std::vector<AccuracyRow> rows;
-  std::ifstream file(path);
-  if (!file) return rows;
-  std::string line;
-  for (int number = 1; std::getline(file, line); ++number) {
-    if (number == 1) continue;
-    std::vector<std::string> fields;
-    std::stringstream text(line);
-    for (std::string field; std::getline(text, field, ',');) fields.push_back(field);
-    const std::string where = path.string() + ": line " + std::to_string(number) + ": ";
-    if (fields.size() != columns().size())
-      throw std::runtime_error(where + std::to_string(fields.size()) + " fields, there must be " +
-                               std::to_string(columns().size()) + "; measure into another folder");
-    AccuracyRow row;
-    for (std::size_t i = 0; i < fields.size(); ++i) {
-      try {
-        columns()[i].set(row, fields[i]);
-      } catch (const std::invalid_argument& error) {
-        throw std::runtime_error(where + columns()[i].name + ": " + error.what());
-      }
-    }
-    rows.push_back(row);
-  }
-  return rows;
+  return read_csv_rows(path, accuracy_columns());
 }
 
 void write_accuracy_rows(const std::filesystem::path& path, const std::vector<AccuracyRow>& rows) {
-  std::string csv;
-  for (const Column& column : columns()) csv += std::string(csv.empty() ? "" : ",") + column.name;
-  csv += '\n';
-  for (const AccuracyRow& row : rows) {
-    std::string line;
-    for (const Column& column : columns()) line += (&column == &columns().front() ? "" : ",") + column.text(row);
-    csv += line + '\n';
-  }
-  write_file(path, csv);
+  write_csv_rows(path, accuracy_columns(), rows);
 }
 
 std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {

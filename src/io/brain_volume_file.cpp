@@ -2,6 +2,7 @@
 
 #include <torch/types.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
@@ -116,6 +117,18 @@ torch::Tensor tissue_classes(const std::filesystem::path& path, const torch::Ten
   return table.index_select(0, whole.flatten()).view(whole.sizes()).to(torch::kUInt8);
 }
 
+BrainVolume read_with_neighbours(const std::string& file) {
+  const std::string ending = file.size() > 3 && file.compare(file.size() - 3, 3, ".gz") == 0 ? ".nii.gz" : ".nii";
+  const std::string stem = file.substr(0, file.size() - std::min(file.size(), ending.size()));
+  const auto beside = [&](const std::vector<const char*>& names) {
+    for (const char* name : names) {
+      if (const std::string path = stem + name + ending; std::filesystem::exists(path)) return path;
+    }
+    return std::string();
+  };
+  return read_brain_volume(file, beside({"_mask"}), beside({"_parc", "_WMZparc"}));
+}
+
 }  // namespace
 
 BrainVolume read_brain_volume(const std::filesystem::path& image, const std::filesystem::path& mask,
@@ -142,6 +155,26 @@ BrainVolume read_brain_volume(const std::filesystem::path& image, const std::fil
     throw std::runtime_error(error.what());
   }
   return volume;
+}
+
+std::vector<BrainVolume> read_brain_volumes(const std::vector<std::string>& files) {
+  std::vector<BrainVolume> volumes;
+  for (const std::string& file : files) {
+    if (std::filesystem::path(file).extension() != ".pt") {
+      volumes.push_back(read_with_neighbours(file));
+      continue;
+    }
+    for (BrainVolume& volume : load_brain_volumes(file)) volumes.push_back(std::move(volume));
+  }
+  return volumes;
+}
+
+std::string volume_name(const std::filesystem::path& file) {
+  std::string name = file.filename().string();
+  for (const std::string ending : {".gz", ".nii"})
+    if (name.size() > ending.size() && name.compare(name.size() - ending.size(), ending.size(), ending) == 0)
+      name.resize(name.size() - ending.size());
+  return name;
 }
 
 Volume to_volume(const torch::Tensor& image, double resolution_mm) {

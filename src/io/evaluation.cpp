@@ -11,8 +11,9 @@
 #include <stdexcept>
 #include <tuple>
 
-#include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/io/atomic_file.h"
+#include "svort_ros/io/evaluation_table.h"
+#include "svort_ros/io/options_file.h"
 
 namespace svort {
 namespace {
@@ -35,17 +36,6 @@ std::map<SliceKey, Pose> by_slice(const std::vector<PoseRow>& rows, const std::s
       throw std::runtime_error(name + ": " + describe(key) + " is there twice");
   }
   return result;
-}
-
-torch::Tensor poses_tensor(const std::vector<Pose>& poses) {
-  torch::Tensor tensor = torch::empty({static_cast<std::int64_t>(poses.size()), 3, 4}, torch::kFloat64);
-  double* out = tensor.data_ptr<double>();
-  for (const Pose& pose : poses) {
-    const TransFirst matrix = trans_first_from_pose(pose);
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 4; ++j) *out++ = matrix(i, j);
-  }
-  return tensor;
 }
 
 std::string fixed(double value, int decimals) {
@@ -145,30 +135,46 @@ std::string to_csv(const Evaluation& evaluation) {
 
 int run_svort_evaluate(int argc, char** argv) {
   CLI::App app(
-      "Scores poses against the truth: distance of the anchor points (ED) and angle (GD), absolute and relative.",
+      "Scores poses against the truth: distance of the anchor points (ED) and angle (GD), absolute and relative. Or, "
+      "with "
+      "--table, measures a whole table of methods on simulated scans; stopped and started again, it goes on.",
       "svort_evaluate");
   std::string poses, truth, output;
   AnchorFrame frame;
-  app.add_option("--poses", poses, "poses.csv of svort_replay or svort_node")->required();
-  app.add_option("--truth", truth, "truth.csv of svort_simulate")->required();
-  app.add_option("--output", output, "folder for evaluation.md and evaluation.csv; made if needed");
+  TableRun table;
+  app.add_option("--poses", poses, "poses.csv of svort_replay or svort_node");
+  app.add_option("--truth", truth, "truth.csv of svort_simulate");
+  app.add_option("--output", output, "folder for the results; made if needed");
   app.add_option("--size-px", frame.width, "width and height of the plane that the anchor points span, pixels")
       ->capture_default_str()
       ->check(CLI::PositiveNumber);
   app.add_option("--pixel-mm", frame.resolution, "its pixel size, mm")
       ->capture_default_str()
       ->check(CLI::PositiveNumber);
+  app.add_option("--table", table.plan, "description of a table of methods (YAML), e.g. config/evaluation/table1.yaml");
+  app.add_option("--rows", table.rows, "only these rows of the table");
+  app.add_flag("--available", table.available, "leave out rows whose weights are not there; the table says so");
+  app.add_option("--threads", table.threads, "of the table; 0: all cores")->capture_default_str();
+  bind_options(app, table.pipeline);
   try {
     app.parse(argc, argv);
+    if (!table.plan.empty()) {
+      if (!poses.empty() || !truth.empty()) throw std::runtime_error("--table excludes --poses and --truth");
+      if (output.empty()) throw std::runtime_error("--table needs --output");
+      table.output = output;
+      measure_table(table);
+      return 0;
+    }
+    if (poses.empty() || truth.empty()) throw std::runtime_error("give --poses and --truth, or --table and --output");
     frame.height = frame.width;
     const Evaluation evaluation = evaluate_poses(read_pose_table(poses), read_pose_table(truth), frame, poses, truth);
-    const std::string table = to_markdown(evaluation);
+    const std::string markdown = to_markdown(evaluation);
     if (!output.empty()) {
       std::filesystem::create_directories(output);
-      write_file(std::filesystem::path(output) / "evaluation.md", table);
+      write_file(std::filesystem::path(output) / "evaluation.md", markdown);
       write_file(std::filesystem::path(output) / "evaluation.csv", to_csv(evaluation));
     }
-    std::fputs(table.c_str(), stdout);
+    std::fputs(markdown.c_str(), stdout);
     return 0;
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? 0 : kBadInput;  // 0: help was asked for

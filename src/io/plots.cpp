@@ -5,50 +5,13 @@
 #include <cmath>
 #include <cstdio>
 #include <map>
-#include <opencv2/imgcodecs.hpp>
-#include <opencv2/imgproc.hpp>
 #include <stdexcept>
 #include <vector>
 
-#include "svort_ros/io/atomic_file.h"
+#include "drawing.h"
 
 namespace svort {
 namespace {
-
-const cv::Scalar kWhite(255, 255, 255);
-const cv::Scalar kInk(40, 40, 40);
-const cv::Scalar kGrid(225, 225, 225);
-// Blue, orange and red that stay apart for colour-blind readers (BGR).
-const cv::Scalar kBlue(178, 114, 0);
-const cv::Scalar kOrange(0, 159, 230);
-const cv::Scalar kRed(0, 60, 200);
-
-enum class Align { left, centre, right };
-
-/// Text with its baseline at `at`.
-void put_text(cv::Mat& image, const std::string& text, cv::Point at, double scale, const cv::Scalar& colour,
-              Align align = Align::left, int weight = 1) {
-  int baseline = 0;
-  const cv::Size size = cv::getTextSize(text, cv::FONT_HERSHEY_SIMPLEX, scale, weight, &baseline);
-  if (align == Align::centre) at.x -= size.width / 2;
-  if (align == Align::right) at.x -= size.width;
-  cv::putText(image, text, at, cv::FONT_HERSHEY_SIMPLEX, scale, colour, weight, cv::LINE_AA);
-}
-
-/// OpenCV's fonts hold ASCII only; other bytes would each show as "?".
-std::string ascii(std::string text, std::size_t longest) {
-  for (char& c : text)
-    if (c < ' ' || c > '~') c = '?';
-  return text.size() <= longest ? text : text.substr(0, longest - 3) + "...";
-}
-
-std::string encode_png(const cv::Mat& image) {
-  std::vector<unsigned char> png;
-  if (!cv::imencode(".png", image, png)) throw std::runtime_error("cannot encode the picture");
-  return {png.begin(), png.end()};
-}
-
-void write_png(const std::filesystem::path& path, const cv::Mat& image) { write_file(path, encode_png(image)); }
 
 // ---- volume ---------------------------------------------------------------------------------------------------------
 
@@ -409,8 +372,18 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
   if (!(y_end > 0.)) y_end = 1.;
   if (!(x_end > 0.)) x_end = 1.;
 
-  cv::Mat image(720, 1500, CV_8UC3, kWhite);
-  const cv::Rect frame(96, 92, 1374, 550);
+  // Legend: where each name stands, in as many lines as they need.
+  constexpr int kLeft = 96, kWidth = 1374, kLine = 24;
+  std::vector<cv::Point> places;
+  cv::Point place(kLeft + 6, 70);
+  for (const Curve& curve : curves) {
+    const int width = 38 + text_width(ascii(curve.name, 40), 0.52) + 34;
+    if (place.x > kLeft + 6 && place.x + width > kLeft + kWidth) place = {kLeft + 6, place.y + kLine};
+    places.push_back(place);
+    place.x += width;
+  }
+  cv::Mat image(650 + place.y, 1500, CV_8UC3, kWhite);
+  const cv::Rect frame(kLeft, place.y + 22, kWidth, 550);
   const int right = frame.x + frame.width;
   const int bottom = frame.y + frame.height;
   const auto at = [&](double x, double y) {
@@ -433,9 +406,15 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
   cv::rotate(label, label, cv::ROTATE_90_COUNTERCLOCKWISE);
   label.copyTo(image(cv::Rect(8, frame.y + frame.height / 2 - 200, label.cols, label.rows)));
 
-  const std::array<cv::Scalar, 6> colours = {
-      kBlue, kOrange, kRed, cv::Scalar(115, 158, 0), cv::Scalar(167, 121, 204), cv::Scalar(100, 100, 100)};
-  int legend = frame.x + 6;
+  const std::array<cv::Scalar, 9> colours = {kBlue,
+                                             kOrange,
+                                             kRed,
+                                             cv::Scalar(115, 158, 0),
+                                             cv::Scalar(167, 121, 204),
+                                             cv::Scalar(100, 100, 100),
+                                             cv::Scalar(233, 180, 86),
+                                             cv::Scalar(66, 228, 240),
+                                             cv::Scalar(40, 40, 110)};
   for (std::size_t i = 0; i < curves.size(); ++i) {
     const cv::Scalar& colour = colours[i % colours.size()];
     std::vector<cv::Point> line;
@@ -444,11 +423,8 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
     if (!curves[i].dots) cv::polylines(image, line, false, colour, 2, cv::LINE_AA);
     if (curves[i].dots || line.size() == 1)
       for (const cv::Point& point : line) draw_dot(image, point, colour);
-    const std::string name = ascii(curves[i].name, 40);
-    cv::line(image, {legend, 70}, {legend + 30, 70}, colour, 3);
-    put_text(image, name, {legend + 38, 76}, 0.52, kInk);
-    int baseline = 0;
-    legend += 38 + cv::getTextSize(name, cv::FONT_HERSHEY_SIMPLEX, 0.52, 1, &baseline).width + 34;
+    cv::line(image, places[i], places[i] + cv::Point(30, 0), colour, 3);
+    put_text(image, ascii(curves[i].name, 40), places[i] + cv::Point(38, 6), 0.52, kInk);
   }
   return encode_png(image);
 }

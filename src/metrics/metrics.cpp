@@ -83,6 +83,17 @@ torch::Tensor window_mean(torch::Tensor image, const std::vector<double>& weight
 
 }  // namespace
 
+torch::Tensor poses_tensor(const std::vector<Pose>& poses) {
+  torch::Tensor tensor = torch::empty({static_cast<std::int64_t>(poses.size()), 3, 4}, torch::kFloat64);
+  double* out = tensor.data_ptr<double>();
+  for (const Pose& pose : poses) {
+    const TransFirst matrix = trans_first_from_pose(pose);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 4; ++j) *out++ = matrix(i, j);
+  }
+  return tensor;
+}
+
 PoseErrors pose_errors(const torch::Tensor& estimated, const torch::Tensor& truth, const AnchorFrame& frame) {
   constexpr const char* kName = "pose_errors";
   const torch::Tensor a = checked_poses(kName, "estimated", estimated), b = checked_poses(kName, "truth", truth);

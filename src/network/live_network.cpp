@@ -294,8 +294,9 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
   std::vector<NetworkStep> steps;
   for (int k = 0; k < iterations; ++k) {
     LiveOutput said;
+    std::vector<torch::Tensor> attention;
     if (k == 0) {
-      said = attend(encode(input.slices, input.slice_resolution_mm), input);
+      said = attend(encode(input.slices, input.slice_resolution_mm), input, {}, &attention);
       current.transforms = compose_transforms(
           pose_consensus(live_votes(said, input, options_), options_.consensus).to(input.transforms.device()),
           input.transforms);
@@ -306,13 +307,14 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
               ? simulate_live_channels(reduced, current.transforms, options_, input.thickness_mm, run.formulation)
               : torch::zeros({reduced.size(0), kLiveSimulatedChannels, reduced.size(2), reduced.size(3)},
                              reduced.options());
-      said = update(simulated, current);
+      said = update(simulated, current, {}, &attention);
       current.transforms = apply_live_update(current.transforms, said.points, options_);
     }
     NetworkStep step;
     step.transforms = current.transforms;
     step.points = anchor_points_from_matrix(current.transforms, frame);
     step.weights = torch::sigmoid(said.quality);
+    step.attention = attention.back().squeeze(0);
     steps.push_back(step);
   }
 

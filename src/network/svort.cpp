@@ -93,12 +93,12 @@ torch::Tensor reconstruct(const SliceAcquisition& acquisition, const NetworkInpu
 }
 
 torch::Tensor solve(const SliceAcquisition& acquisition, const torch::Tensor& start, const torch::Tensor& weights,
-                    const NetworkInput& input, const NetworkRun& run) {
+                    const NetworkInput& input, const NetworkRun& run, bool gradient) {
   const StageClock::Scope scope(run.clock, "conjugate_gradients");
   ConjugateGradientOptions options;
   options.iterations = kConjugateGradients;
-  return solve_weighted_inverse(for_model(input.slices, input), acquisition, for_model(weights, input),
-                                for_model(start, input), options)
+  const torch::Tensor trusted = gradient ? weights.to(model_device(input)).contiguous() : for_model(weights, input);
+  return solve_weighted_inverse(for_model(input.slices, input), acquisition, trusted, for_model(start, input), options)
       .to(input.slices.device());
 }
 
@@ -213,7 +213,7 @@ Svort::VolumeUpdate SvortV1::estimate_volume(const torch::Tensor& points, const 
   const torch::Tensor axisangle = matrix_to_axisangle(transforms_of(points)).to(input.slices.device());
   update.weights = weights_from_score(
       quality_network(input.slices, simulated, torch::cat({axisangle, input.positions}, 1), run).values);
-  update.volume = solve(acquisition, update.reconstructed, update.weights, input, run);
+  update.volume = solve(acquisition, update.reconstructed, update.weights, input, run, volume_gradient_);
   return update;
 }
 
@@ -235,7 +235,7 @@ Svort::VolumeUpdate SvortV2::estimate_volume(const torch::Tensor& points, const 
   VolumeUpdate update;
   update.weights = weights;
   update.reconstructed = reconstruct(acquisition, input, run);
-  update.volume = solve(acquisition, update.reconstructed, weights, input, run);
+  update.volume = solve(acquisition, update.reconstructed, weights, input, run, volume_gradient_);
   return update;
 }
 

@@ -213,4 +213,48 @@ StepLoss AnchorRecipe::loss(const std::vector<SimulatedScan>& scans, std::uint64
                               anchor_points_from_matrix(batch.truth, frame) / kLiveUnitMm)}});
 }
 
+PaperRecipe::PaperRecipe(std::shared_ptr<SvortV1> network, const PaperRecipeOptions& options, const NetworkGrid& grid,
+                         torch::ScalarType precision)
+    : network_(std::move(network)), options_(options), grid_(grid), precision_(precision) {
+  const auto usable = [](double value) { return value >= 0. && std::isfinite(value); };
+  if (!usable(options.point_weight)) throw std::invalid_argument("paper.point_weight must be zero or positive");
+  if (!usable(options.volume_weight)) throw std::invalid_argument("paper.volume_weight must be zero or positive");
+  if (!(options.volume_beta > 0. && std::isfinite(options.volume_beta)))
+    throw std::invalid_argument("paper.volume_beta must be positive");
+  network_->set_volume_gradient(options.volume_weight > 0.);
+}
+
+StepLoss PaperRecipe::loss(const std::vector<SimulatedScan>& scans, std::uint64_t /*step*/) {
+  NetworkRun run;
+  run.formulation = AcquisitionFormulation::fast;
+  run.precision = precision_;
+  torch::Tensor points, volume;
+  double last = 0., start = 0.;
+  const auto add = [](torch::Tensor* sum, const torch::Tensor& term) { *sum = sum->defined() ? *sum + term : term; };
+  for (const SimulatedScan& scan : scans) {
+    const NetworkInput& input = scan.input;
+    const AnchorFrame frame = {static_cast<int>(input.slices.size(3)), static_cast<int>(input.slices.size(2)),
+                               input.slice_resolution_mm};
+    const torch::Tensor truth = anchor_points_from_matrix(scan.truth, frame);
+    const double share = 1. / static_cast<double>(scans.size());
+    torch::Tensor error;
+    for (const NetworkStep& step : network_->run(input, grid_, run)) {
+      error = anchor_loss(step.points, truth).mean() * share;
+      add(&points, error);
+      const torch::Tensor difference =
+          smooth_l1_loss(step.volume.flatten().unsqueeze(0), scan.volume.flatten().unsqueeze(0), options_.volume_beta);
+      add(&volume, difference.mean() * share);
+    }
+    last += error.item<double>();
+    start += anchor_loss(anchor_points_from_matrix(input.transforms, frame), truth).mean().item<double>() * share;
+  }
+  StepLoss loss;
+  loss.total = options_.point_weight * points + options_.volume_weight * volume;
+  loss.parts = {{"points", points.item<double>()},
+                {"volume", volume.item<double>()},
+                {"last_points", last},
+                {"start_points", start}};
+  return loss;
+}
+
 }  // namespace svort

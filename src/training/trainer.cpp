@@ -1,6 +1,7 @@
 #include "svort_ros/training/trainer.h"
 
 #include <ATen/Parallel.h>
+#include <torch/cuda.h>
 #include <torch/nn/utils/clip_grad.h>
 #include <torch/serialize.h>
 
@@ -66,6 +67,23 @@ std::string duration(double seconds) {
 }
 
 }  // namespace
+
+torch::Device training_device(const TrainerOptions& options) {
+  const bool gpu = torch::cuda::is_available();
+  require(options.device == "auto" || options.device == "cpu" || options.device == "cuda",
+          "device is '" + options.device + "'; it must be auto, cpu or cuda");
+  require(options.device != "cuda" || gpu, "device is 'cuda', but LibTorch sees no GPU here");
+  return options.device == "cpu" || !gpu ? torch::Device(torch::kCPU) : torch::Device(torch::kCUDA, 0);
+}
+
+torch::ScalarType training_precision(const TrainerOptions& options, const torch::Device& device) {
+  if (options.precision == "float32") return torch::kFloat32;
+  require(options.precision == "bfloat16",
+          "precision is '" + options.precision + "'; it must be float32 or bfloat16 (mixed precision)");
+  require(device.is_cuda(),
+          "precision is 'bfloat16': mixed precision is for GPUs; on the CPU it is slower than float32");
+  return torch::kBFloat16;
+}
 
 Trainer::Trainer(std::shared_ptr<TrainingRecipe> recipe, std::vector<std::shared_ptr<ScanSimulator>> training,
                  std::shared_ptr<ScanSimulator> validation, const TrainerOptions& options, std::filesystem::path folder)
@@ -139,13 +157,23 @@ std::map<std::string, double> Trainer::step() {
   recipe_->network().train();
   // Parameters that a step does not use get no gradient, and AdamW leaves them alone.
   for (torch::Tensor& parameter : optimizer_.param_groups().front().params()) parameter.mutable_grad().reset();
-  StepLoss loss = recipe_->loss(scans, static_cast<std::uint64_t>(number));
-  bool usable = std::isfinite(loss.total.item<double>());
+  const std::size_t at_once = recipe_->scans_at_once() > 0 ? recipe_->scans_at_once() : scans.size();
+  std::map<std::string, double> parts;
+  bool usable = true;
+  for (std::size_t begin = 0; usable && begin < scans.size(); begin += at_once) {
+    const std::size_t count = std::min(at_once, scans.size() - begin);
+    const auto first = scans.begin() + static_cast<std::ptrdiff_t>(begin);
+    const double share = static_cast<double>(count) / static_cast<double>(scans.size());
+    const StepLoss loss =
+        recipe_->loss({first, first + static_cast<std::ptrdiff_t>(count)}, static_cast<std::uint64_t>(number));
+    usable = std::isfinite(loss.total.item<double>());
+    if (usable) (loss.total * share).backward();
+    for (const auto& [name, value] : loss.parts) parts[name] += share * value;
+  }
   if (usable) {
-    loss.total.backward();
     const double norm = torch::nn::utils::clip_grad_norm_(recipe_->network().parameters(), options_.clip);
     usable = std::isfinite(norm);
-    loss.parts["gradient"] = norm;
+    parts["gradient"] = norm;
   }
   if (!usable) {
     ++progress_.skipped;
@@ -153,7 +181,7 @@ std::map<std::string, double> Trainer::step() {
   }
   optimizer_.step();
   update_average();
-  return loss.parts;
+  return parts;
 }
 
 void Trainer::update_average() {
@@ -221,7 +249,7 @@ void Trainer::resume() {
   if (!std::filesystem::exists(path)) throw std::runtime_error(path.string() + ": there is nothing to resume");
   try {
     torch::serialize::InputArchive archive, network, optimizer;
-    archive.load_from(path.string());
+    archive.load_from(path.string(), recipe_->network().parameters().front().device());
     archive.read("network", network);
     archive.read("optimizer", optimizer);
     recipe_->network().load(network);

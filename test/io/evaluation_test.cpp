@@ -116,6 +116,8 @@ TEST_F(EvaluationFile, ProgramSaysWhatIsWrong) {
   EXPECT_EQ(run({"svort_evaluate", "--help"}), 0);
   EXPECT_EQ(run({"svort_evaluate"}), 2);
   EXPECT_EQ(run({"svort_evaluate", "--poses", path("none.csv").string(), "--truth", path("none.csv").string()}), 2);
+  EXPECT_EQ(run({"svort_evaluate", "--table", path("none.yaml").string(), "--output", path("out").string()}), 2);
+  EXPECT_EQ(run({"svort_evaluate", "--table", path("none.yaml").string(), "--poses", path("none.csv").string()}), 2);
 }
 
 }  // namespace

@@ -40,5 +40,26 @@ TEST(TrainingConfigs, TheLiveTrainingIsOneThatTheTrainerTakes) {
   EXPECT_NO_THROW(LiveRecipe(std::make_shared<LiveNetwork>(config.network), config.recipe, 1));
 }
 
+TEST(TrainingConfigs, ThePapersTrainingsAreOnesThatTheTrainerTakes) {
+  for (const auto& [file, kind] :
+       {std::pair{"v1.yaml", "v1"}, std::pair{"svrnet.yaml", "svrnet"}, std::pair{"plane_in_vol.yaml", "planeinvol"}}) {
+    TrainingConfig config;
+    load_options(kConfigs / "training" / file, config);
+    EXPECT_EQ(config.kind, kind);
+    EXPECT_FALSE(config.volumes.empty()) << file;
+    EXPECT_FALSE(config.note.empty()) << file;
+    for (const std::string& held_out : config.held_out)
+      EXPECT_EQ(std::count(config.volumes.begin(), config.volumes.end(), held_out), 0) << held_out;
+    // The paper's schedule: 200,000 scans, linear to 0.
+    EXPECT_EQ(config.trainer.total_steps * config.trainer.scans_per_step, 200000) << file;
+    EXPECT_EQ(config.trainer.schedule, "linear") << file;
+    EXPECT_EQ(config.trainer.learning_rate, 2e-4) << file;
+    for (const std::string& protocol : config.protocols) {
+      config.simulator.scanner.protocol = protocol;
+      EXPECT_NO_THROW(check(config.simulator.scanner)) << protocol;
+    }
+  }
+}
+
 }  // namespace
 }  // namespace svort

@@ -15,7 +15,9 @@ namespace svort {
 /// Which scan to simulate.
 struct EvaluationScanOptions {
   std::string motion = "moderate";  ///< class, see motion_classes()
-  int stacks = 3;                   ///< the first so many of the three stacks of the same scan
+  /// See ScannerOptions::protocol. Slices carry the poses that the scanner prescribed in either case.
+  std::string protocol = "scanner";
+  int stacks = 3;  ///< the first so many of the three stacks of the same scan
   /// Masks as a segmentation that often fails makes them: 15 % of the slices have none, 25 % are cut, 20 % too small.
   bool damaged_masks = false;
   std::uint64_t seed = 1;

@@ -1,6 +1,8 @@
 #pragma once
 
 #include <filesystem>
+#include <string>
+#include <vector>
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/simulation/brain_volume.h"
@@ -20,6 +22,14 @@ namespace svort {
 ///         labels that are no whole numbers or of neither kind
 BrainVolume read_brain_volume(const std::filesystem::path& image, const std::filesystem::path& mask = {},
                               const std::filesystem::path& parcellation = {});
+
+/// Reads several: NAME.nii or NAME.nii.gz with NAME_mask and NAME_parc or NAME_WMZparc beside it, as far as they are
+/// there, or files of save_brain_volumes() (.pt). Names are the files'.
+/// @throws std::runtime_error as read_brain_volume() and load_brain_volumes()
+std::vector<BrainVolume> read_brain_volumes(const std::vector<std::string>& files);
+
+/// The name of a volume's file, without folder and ending (.nii, .nii.gz).
+std::string volume_name(const std::filesystem::path& file);
 
 /// The volume as NIfTI would have it, for files.
 Volume to_volume(const torch::Tensor& image, double resolution_mm);

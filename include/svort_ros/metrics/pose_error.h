@@ -3,11 +3,15 @@
 #include <torch/types.h>
 
 #include <cstdint>
+#include <vector>
 
 #include "svort_ros/geometry/anchor_points.h"
 #include "svort_ros/geometry/pose.h"
 
 namespace svort {
+
+/// Poses as the functions below take them: n x 3 x 4, trans_first, mm, float64.
+torch::Tensor poses_tensor(const std::vector<Pose>& poses);
 
 /// Errors of poses, slice by slice (paper, sec. 3).
 struct PoseErrors {

@@ -55,7 +55,8 @@ SvortOptions svort_v2_options();
 ///
 /// Both follow the public implementation at inference: batch statistics, forward model in every tap, quality of the
 /// slices as a softmax over them times their number, two conjugate-gradient steps from the PSF reconstruction. Nothing
-/// flows back through the volume. The volume starts as nothing: the first network sees the slices alone.
+/// flows back from one iteration to the one before it. The volume starts as nothing: the first network sees the slices
+/// alone.
 class Svort : public PoseNetwork {
  public:
   /// What a transformation update answers.
@@ -72,6 +73,10 @@ class Svort : public PoseNetwork {
   };
 
   std::vector<NetworkStep> run(const NetworkInput& input, const NetworkGrid& grid, const NetworkRun& run) override;
+
+  /// Whether the volume that run() and estimate_volume() answer carries a gradient with respect to the slices' weights,
+  /// as the paper's loss of the volume needs. Off unless set: it costs memory.
+  void set_volume_gradient(bool on) { volume_gradient_ = on; }
 
   /// Transformation update of iteration k (from 0) on its own.
   /// @param points n x 9, before it
@@ -91,6 +96,7 @@ class Svort : public PoseNetwork {
  protected:
   explicit Svort(const SvortOptions& options) : options_(options) {}
   const SvortOptions options_;
+  bool volume_gradient_ = false;
 };
 
 /// Version 1, the paper's: a network of its own for every iteration, and a second kind that finds the slices' quality.

@@ -11,6 +11,7 @@
 #include "svort_ros/network/baselines.h"
 #include "svort_ros/network/live_network.h"
 #include "svort_ros/network/pose_network.h"
+#include "svort_ros/network/svort.h"
 #include "svort_ros/simulation/scan_simulator.h"
 
 namespace svort {
@@ -31,6 +32,8 @@ class TrainingRecipe {
   /// @param scans at least one, none without slices
   /// @param step  number of the step: what is random in the recipe depends on it and the seed alone
   virtual StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) = 0;
+  /// How many scans of a step loss() takes at once: gradients of the others are added up. 0: all.
+  virtual std::size_t scans_at_once() const { return 0; }
 };
 
 /// How the live network is trained.
@@ -101,6 +104,44 @@ class AnchorRecipe : public TrainingRecipe {
 
  private:
   std::shared_ptr<AnchorRegressor> network_;
+};
+
+/// How SVoRT version 1 is trained.
+struct PaperRecipeOptions {
+  double point_weight = 0.1;    ///< of the mean squared distance of the anchor points' coordinates, mm^2
+  double volume_weight = 100.;  ///< lambda of the paper: of the mean absolute difference of the volumes
+  double volume_beta = 0.01;    ///< the difference is squared where it is smaller, as in the public implementation
+
+  template <class Visitor>
+  void visit(Visitor&& v) {
+    v("point_weight", point_weight, "of the mean squared distance of the anchor points, mm^2");
+    v("volume_weight", volume_weight, "of the mean absolute difference of the volumes (lambda of the paper)");
+    v("volume_beta", volume_beta, "differences of the volumes below this count squared");
+  }
+};
+
+/// The paper's recipe for version 1 (sec. 2.4): squared distance of the anchor points and absolute difference of the
+/// volumes, summed over the iterations. The pose networks learn from the points, the quality network from the volume,
+/// whose weighted inverse problem is differentiable in the slices' weights. Scan by scan: the batch that is normalised
+/// over is the scan.
+class PaperRecipe : public TrainingRecipe {
+ public:
+  /// @param grid      of SimulatedScan::volume, with which the network's volumes are compared
+  /// @param precision of the networks' layers
+  /// @throws std::invalid_argument naming the option that is out of range
+  PaperRecipe(std::shared_ptr<SvortV1> network, const PaperRecipeOptions& options, const NetworkGrid& grid,
+              torch::ScalarType precision = torch::kFloat32);
+
+  PoseNetwork& network() override { return *network_; }
+  std::vector<std::string> parts() const override { return {"points", "volume", "last_points", "start_points"}; }
+  StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
+  std::size_t scans_at_once() const override { return 1; }
+
+ private:
+  std::shared_ptr<SvortV1> network_;
+  PaperRecipeOptions options_;
+  NetworkGrid grid_;
+  torch::ScalarType precision_;
 };
 
 /// Several scans as one input, one after another. `slice_resolution_mm` must agree; `thickness_mm` and `common_frame`

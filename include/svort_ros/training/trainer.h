@@ -31,9 +31,10 @@ struct TrainerOptions {
   double validation_minutes = 30.;    ///< time between validations
   int validation_scans = 12;          ///< scans of the held-out volumes per validation
   std::int64_t log_steps = 20;        ///< steps per row of the log
-  bool prefetch = false;  ///< make the next step's scans on another thread meanwhile; the result is the same
-  int threads = 1;        ///< CPU threads
-  std::string precision = "float32";  ///< of the convolutions: float32 or bfloat16
+  bool prefetch = false;        ///< make the next step's scans on another thread meanwhile; the result is the same
+  int threads = 1;              ///< CPU threads
+  std::string device = "auto";  ///< where scans are made and the network is trained: auto, cpu or cuda
+  std::string precision = "float32";  ///< of the layers: float32, or bfloat16 (mixed precision; on a GPU alone)
 
   template <class Visitor>
   void visit(Visitor&& v) {
@@ -53,9 +54,19 @@ struct TrainerOptions {
     v("log_steps", log_steps, "steps per row of the log");
     v("prefetch", prefetch, "make the next step's scans on another thread meanwhile");
     v("threads", threads, "CPU threads");
-    v("precision", precision, "of the convolutions: float32 or bfloat16");
+    v("device", device, "auto (a GPU if there is one), cpu or cuda");
+    v("precision", precision, "float32, or bfloat16: mixed precision, on a GPU alone");
   }
 };
+
+/// The device that the options ask for.
+/// @throws std::invalid_argument naming the option: an unknown device, or a GPU where LibTorch sees none
+torch::Device training_device(const TrainerOptions& options);
+
+/// The precision of the layers on that device; geometry, losses and weights are float32 in any case.
+/// @throws std::invalid_argument naming the option: an unknown precision, or mixed precision on the CPU, where it is
+///         slower than float32
+torch::ScalarType training_precision(const TrainerOptions& options, const torch::Device& device);
 
 /// Where training stands.
 struct TrainingProgress {
@@ -79,6 +90,7 @@ struct ValidationResult {
 /// Scan numbers and random choices follow from the step number, so a resumed run continues as if it had not stopped.
 class Trainer {
  public:
+  /// @param recipe     its network is on the device that it is to be trained on
   /// @param training   one or more simulators; the steps take turns. One that is listed twice has twice the share
   /// @param validation may be null: then nothing is validated
   /// @throws std::invalid_argument naming the option that is out of range
