@@ -1,5 +1,7 @@
 #include "scored_poses.h"
 
+#include <algorithm>
+
 #include "svort_ros/acquisition/geometry_of_poses.h"
 #include "svort_ros/metrics/image_similarity.h"
 
@@ -36,13 +38,25 @@ FrameScore score_frame(const std::vector<Pose>& T_brain_slice, const std::vector
 }
 
 VolumeScore score_volume(const torch::Tensor& volume, const torch::Tensor& truth) {
+  // Only the brain counts: a box around it, with room for the window of SSIM, gives the same numbers sooner.
+  constexpr std::int64_t kRoom = 6;
+  torch::Tensor test = volume, reference = truth;
+  for (std::int64_t axis = 0; axis < 3; ++axis) {
+    const torch::Tensor bright = torch::nonzero((reference > 0).transpose(0, axis).flatten(1).any(1)).flatten();
+    if (bright.numel() == 0) break;
+    const std::int64_t begin = std::max<std::int64_t>(0, bright[0].item<std::int64_t>() - kRoom);
+    const std::int64_t end = std::min(reference.size(axis), bright[-1].item<std::int64_t>() + 1 + kRoom);
+    test = test.slice(axis, begin, end);
+    reference = reference.slice(axis, begin, end);
+  }
   SimilarityOptions options;
-  options.mask = truth > 0;
-  const torch::Tensor a = volume.masked_select(options.mask), b = truth.masked_select(options.mask);
+  options.mask = reference > 0;
+  options.data_range = (truth.max() - truth.min()).item<double>();
+  const torch::Tensor a = test.masked_select(options.mask), b = reference.masked_select(options.mask);
   const double gain = ((a * b).sum() / (a * a).sum().clamp_min(1e-12)).item<double>();
-  const torch::Tensor fitted = volume * gain;
-  return {peak_signal_to_noise(fitted, truth, options),
-          structural_similarity(fitted, truth, SsimWindow::gaussian, options).mean};
+  const torch::Tensor fitted = test * gain;
+  return {peak_signal_to_noise(fitted, reference, options),
+          structural_similarity(fitted, reference, SsimWindow::gaussian, options).mean};
 }
 
 SliceAcquisition acquisition_on_truth(const EvaluationScan& scan, const RegistrationInput& input,
