@@ -118,8 +118,8 @@ std::string training_notes(const TableRows& rows) {
     } else if (*row.scans_seen < *most->scans_seen) {
       const double share = static_cast<double>(*row.scans_seen) / static_cast<double>(*most->scans_seen);
       text += "* " + row.method.name + " was **trained less**: " + std::to_string(*row.scans_seen) + " scans, " +
-              fixed(100. * share, 0) + " % of the " + std::to_string(*most->scans_seen) + " of " + most->method.name +
-              ".\n";
+              fixed(100. * share, share < 0.1 ? 1 : 0) + " % of the " + std::to_string(*most->scans_seen) + " of " +
+              most->method.name + ".\n";
     } else {
       text += "* " + row.method.name + " was trained on " + std::to_string(*row.scans_seen) + " scans.\n";
     }
@@ -281,8 +281,8 @@ std::string table_markdown(const TablePlan& plan, const TableRows& rows, const s
                       of_poses(svr, &MethodScore::ed_mm, 2), of_poses(svr, &MethodScore::relative_ed_mm, 2)});
       }
   }
-  text << "\nMean (standard deviation) over scans of each scan's mean over slices; " << plan.stacks
-       << " stacks, protocol " << plan.protocol << ". docs/evaluation.md says what is measured.\n";
+  text << "\nMean (standard deviation) over scans of each scan's mean over slices. Stacks: " << plan.stacks
+       << "; protocol: " << plan.protocol << ". docs/evaluation.md says what is measured.\n";
   text << training_notes(rows);
   if (!rows.refused.empty()) text << "\nNot measured:\n\n";
   for (const auto& [name, reason] : rows.refused) text << "* " << name << ": " << reason << "\n";
