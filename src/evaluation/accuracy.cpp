@@ -9,6 +9,7 @@
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/registration/canonical_frame.h"
+#include "svort_ros/registration/scan_registration.h"
 
 namespace svort {
 namespace {
@@ -85,8 +86,11 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   if (method.refined || method.source == PoseSource::stacks || method.source == PoseSource::registration) {
     RefinementOptions refinement = options.estimator.registration;
     if (method.source == PoseSource::stacks) refinement.trajectory_passes = 0;
-    const std::vector<Pose> start = crops;
-    const Refinement refined = refine_poses(input, start, refinement);
+    // From the scanner's poses the stacks may be anywhere; from a network's or for the stack stage, these poses count.
+    const Refinement refined = method.source == PoseSource::registration
+                                   ? register_scan(input, {crops}, options.estimator.volume_size_mm, refinement,
+                                                   options.estimator.template_match)
+                                   : refine_poses(input, crops, refinement);
     crops.clear();
     for (std::size_t i = 0; i < row.slices; ++i) {
       crops.push_back(refined.slices[i].T_brain_slice);

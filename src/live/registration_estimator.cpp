@@ -12,6 +12,7 @@
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
 #include "svort_ros/registration/canonical_frame.h"
+#include "svort_ros/registration/scan_registration.h"
 
 namespace svort {
 namespace {
@@ -265,9 +266,9 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
     const Pose T_brain_world = best_fit(input.T_world_slice, current, half_field_mm(sequence));
     std::vector<Pose> nominal;
     for (const Pose& pose : input.T_world_slice) nominal.push_back(T_brain_world * pose);
-    const Refinement from_current = refine_poses(input, current, options_.registration);
-    const Refinement from_nominal = refine_poses(input, nominal, options_.registration);
-    take(sequence, from_current.report.last_cost <= from_nominal.report.last_cost ? from_current : from_nominal,
+    take(sequence,
+         register_scan(input, {current, nominal}, options_.volume_size_mm, options_.registration,
+                       options_.template_match),
          current);
     if (incremental_) {
       tell_incremental(sequence);

@@ -1,10 +1,8 @@
 #include "svort_ros/registration/canonical_frame.h"
 
-#include <torch/types.h>
+#include <stdexcept>
 
-#include <cmath>
-
-#include "svort_ros/registration/pose_refinement.h"
+#include "rough_volume.h"
 
 namespace svort {
 
@@ -13,11 +11,10 @@ std::optional<TemplateMatch> find_canonical_frame(const RegistrationInput& input
                                                   const std::vector<BrainTemplate>& templates, double size_mm,
                                                   const TemplateOptions& options) {
   if (templates.empty()) return std::nullopt;
-  Volume rough;
-  rough.grid.size.setConstant(static_cast<int>(std::lround(size_mm / options.voxel_mm)));
-  rough.grid.spacing.setConstant(options.voxel_mm);
-  const torch::Tensor volume = reconstruct_weighted(input, poses, weights, rough.grid.size.x(), options.voxel_mm);
-  rough.values.assign(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
+  validate(input);
+  if (poses.size() != input.count() || weights.size() != input.count())
+    throw std::invalid_argument("find_canonical_frame: poses and weights must have one entry per slice");
+  const Volume rough = rough_volume(input, poses, weights, size_mm, options.voxel_mm);
   const double brain = brain_volume_mm3(rough);
   if (!(brain > 0.)) return std::nullopt;
   return match_template(rough, templates[nearest_templates(templates, brain, 1).front()], options);

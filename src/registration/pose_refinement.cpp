@@ -13,30 +13,14 @@
 #include "../acquisition/parallel.h"
 #include "registration_level.h"
 #include "slice_weight.h"
-#include "svort_ros/acquisition/geometry_of_poses.h"
-#include "svort_ros/acquisition/slice_acquisition.h"
-#include "svort_ros/reconstruction/volume_estimation.h"
 #include "trajectory.h"
+#include "weighted_volume.h"
 
 namespace svort {
 namespace {
 
 constexpr double kFwhmPerSigma = 2.354820045;
 constexpr double kInPlaneFwhm = 1.2;  // pixels (paper, sec. 2)
-
-SliceAcquisition acquisition_of(const torch::Tensor& slices, const torch::Tensor& masks, const std::vector<Pose>& poses,
-                                const std::vector<double>& thickness_mm, double pixel_mm, std::int64_t size,
-                                double voxel_mm) {
-  return SliceAcquisition(geometry_of_poses(poses, thickness_mm, pixel_mm, voxel_mm), static_cast<int>(slices.size(2)),
-                          static_cast<int>(slices.size(3)), {size, size, size}, AcquisitionFormulation::fast,
-                          {masks, {}});
-}
-
-torch::Tensor tensor_of(const std::vector<double>& weights) {
-  torch::Tensor w = torch::empty({static_cast<std::int64_t>(weights.size())}, torch::kFloat32);
-  for (std::size_t i = 0; i < weights.size(); ++i) w.data_ptr<float>()[i] = static_cast<float>(weights[i]);
-  return w;
-}
 
 std::vector<float> values_of(const torch::Tensor& volume) {
   return std::vector<float>(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
@@ -126,18 +110,14 @@ class Refiner {
     const auto size = static_cast<std::int64_t>(std::ceil(2. * std::min(radius, 90.) / level_.pixel_mm)) + 6;
     std::vector<double> weights;
     for (const RefinedSlice& slice : slices_) weights.push_back(slice.weight);
-    const torch::Tensor w = tensor_of(weights).view({-1, 1, 1, 1});
-    const SliceAcquisition acquisition = acquisition_of(level_.slices, level_.masks, poses_, input_.thickness_mm,
-                                                        level_.pixel_mm, size, level_.pixel_mm);
-    const torch::Tensor total = acquisition.adjoint(w.expand_as(level_.slices).contiguous(), false);
-    const torch::Tensor sums = acquisition.adjoint((level_.slices * w).contiguous(), false);
-    const float least = 1e-3F * std::max(1e-12F, total.max().item<float>());
-    const torch::Tensor volume = torch::where(total > least, sums / total.clamp_min(least), torch::zeros_like(sums));
+    const SliceAcquisition acquisition =
+        cube_acquisition(level_.masks, poses_, input_.thickness_mm, level_.pixel_mm, size, level_.pixel_mm);
+    const WeightedVolume all = weighted_volume(level_.slices, acquisition, weights);
     const double sigma = kInPlaneFwhm / kFwhmPerSigma;
-    volume_ = SampledVolume(blurred(values_of(volume), static_cast<int>(size), sigma), static_cast<int>(size),
+    volume_ = SampledVolume(blurred(values_of(all.mean()), static_cast<int>(size), sigma), static_cast<int>(size),
                             level_.pixel_mm);
     if (one_stack_) return;
-    support_ = SampledVolume(values_of(total), static_cast<int>(size), level_.pixel_mm);
+    support_ = SampledVolume(values_of(all.support), static_cast<int>(size), level_.pixel_mm);
 
     // What a slice of weight 1 gives to the voxels of its own plane, alone.
     const auto largest = static_cast<std::int64_t>(
@@ -146,8 +126,8 @@ class Refiner {
         level_.points.begin());
     const auto index = static_cast<std::size_t>(largest);
     const torch::Tensor one = level_.slices.narrow(0, largest, 1), mask = level_.masks.narrow(0, largest, 1);
-    const torch::Tensor alone = acquisition_of(one, mask.contiguous(), {poses_[index]}, {input_.thickness_mm[index]},
-                                               level_.pixel_mm, size, level_.pixel_mm)
+    const torch::Tensor alone = cube_acquisition(mask.contiguous(), {poses_[index]}, {input_.thickness_mm[index]},
+                                                 level_.pixel_mm, size, level_.pixel_mm)
                                     .adjoint(torch::ones_like(one), false);
     const SampledVolume own(values_of(alone), static_cast<int>(size), level_.pixel_mm);
     own_support_ = mean_support(own, index);
@@ -320,15 +300,22 @@ Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>&
 }
 
 torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::vector<Pose>& poses,
-                                   const std::vector<double>& weights, std::int64_t size, double voxel_mm) {
+                                   const std::vector<double>& weights, std::int64_t size, double voxel_mm,
+                                   bool fading) {
   validate(input);
   if (poses.size() != input.count() || weights.size() != input.count())
     throw std::invalid_argument("registration: poses and weights must have one entry per slice");
   const torch::NoGradGuard no_grad;
-  return reconstruct_psf(
-      input.slices * input.masks,
-      acquisition_of(input.slices, input.masks, poses, input.thickness_mm, input.resolution_mm, size, voxel_mm),
-      tensor_of(weights));
+  const SliceAcquisition acquisition =
+      cube_acquisition(input.masks, poses, input.thickness_mm, input.resolution_mm, size, voxel_mm);
+  const WeightedVolume all = weighted_volume(input.slices * input.masks, acquisition, weights);
+  if (!fading) return all.mean();
+  // What few pixels have reached is mostly the tail of a PSF beyond the brain's edge, and would be as bright as the
+  // edge. One stack without gaps gives each voxel this much.
+  double thickness_mm = 0.;
+  for (const double each : input.thickness_mm) thickness_mm += each / static_cast<double>(input.count());
+  const double one_stack = voxel_mm * voxel_mm * voxel_mm / (input.resolution_mm * input.resolution_mm * thickness_mm);
+  return all.sums / all.support.clamp_min(0.5 * one_stack);
 }
 
 }  // namespace svort

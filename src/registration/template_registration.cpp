@@ -55,13 +55,15 @@ Shape shape_of(const Volume& volume) {
   return shape;
 }
 
-/// The volume around its centroid as a blurred cube of coarse voxels, bright tissue at 1.
+/// The structure of the brain around the volume's centroid, in coarse voxels: brightness (bright tissue at 1) less a
+/// wider blur of it. What is left are cortex, ventricles and outline, whatever the shading and however round the brain.
 SampledVolume centred(const Volume& volume, const Shape& shape, const TemplateOptions& options) {
   const double radius = 1.7 * std::cbrt(shape.volume_mm3 * 3. / (4. * M_PI)) + 2. * options.blur_mm;
   const int size = 2 * static_cast<int>(std::ceil(radius / options.voxel_mm)) + 1;
   const auto n = static_cast<std::size_t>(size);
   std::vector<float> sums(n * n * n, 0.F);
-  // Every fine voxel goes to the nearest coarse one: an average, which a blur of a voxel or more makes smooth.
+  // Every voxel is shared among the eight coarse ones around it. Given whole to the nearest, voxels that are as large
+  // as the coarse ones would move by up to half of one, all the same way.
   std::vector<float> counts(n * n * n, 0.F);
   const float scale = 1.F / bright_of(volume);
   std::size_t offset = 0;
@@ -69,19 +71,30 @@ SampledVolume centred(const Volume& volume, const Shape& shape, const TemplateOp
     for (int y = 0; y < volume.grid.size.y(); ++y) {
       for (int x = 0; x < volume.grid.size.x(); ++x, ++offset) {
         const Eigen::Vector3d p = volume.grid.position(Eigen::Vector3d(x, y, z)) - shape.centroid;
-        const Eigen::Vector3i i =
-            (p / options.voxel_mm + Eigen::Vector3d::Constant(0.5 * size)).array().floor().cast<int>();
-        if ((i.array() < 0).any() || (i.array() >= size).any()) continue;
-        const std::size_t to = (static_cast<std::size_t>(i.z()) * n + static_cast<std::size_t>(i.y())) * n +
-                               static_cast<std::size_t>(i.x());
-        sums[to] += std::min(1.5F, volume.values[offset] * scale);
-        counts[to] += 1.F;
+        const Eigen::Vector3d at = p / options.voxel_mm + Eigen::Vector3d::Constant(0.5 * (size - 1));
+        const Eigen::Vector3i first = at.array().floor().cast<int>();
+        if ((first.array() < 0).any() || (first.array() + 1 >= size).any()) continue;
+        const Eigen::Vector3f f = (at - first.cast<double>()).cast<float>();
+        const float value = std::min(1.5F, volume.values[offset] * scale);
+        for (int corner = 0; corner < 8; ++corner) {
+          const Eigen::Vector3i step(corner & 1, corner >> 1 & 1, corner >> 2);
+          const Eigen::Vector3i i = first + step;
+          float share = 1.F;
+          for (int axis = 0; axis < 3; ++axis) share *= step[axis] ? f[axis] : 1.F - f[axis];
+          const std::size_t to = (static_cast<std::size_t>(i.z()) * n + static_cast<std::size_t>(i.y())) * n +
+                                 static_cast<std::size_t>(i.x());
+          sums[to] += share * value;
+          counts[to] += share;
+        }
       }
     }
   }
   for (std::size_t i = 0; i < sums.size(); ++i)
     if (counts[i] > 0.F) sums[i] /= counts[i];
-  return SampledVolume(blurred(std::move(sums), size, options.blur_mm / options.voxel_mm), size, options.voxel_mm);
+  std::vector<float> structure = blurred(sums, size, options.blur_mm / options.voxel_mm);
+  const std::vector<float> wide = blurred(std::move(sums), size, options.wide_blur_mm / options.voxel_mm);
+  for (std::size_t i = 0; i < structure.size(); ++i) structure[i] -= wide[i];
+  return SampledVolume(std::move(structure), size, options.voxel_mm);
 }
 
 /// Rotations spread evenly and deterministically over SO(3): a spiral on the 3-sphere whose two angles advance by
@@ -105,26 +118,31 @@ struct Candidate {
   double correlation = -2.;
 };
 
-/// Points of the template, with their brightness, to look up in the volume.
+/// Points of the template, with their values, to look up in the volume.
 struct Points {
   std::vector<Eigen::Vector3f> position;
   std::vector<float> value;
 };
 
-Points bright_points(const SampledVolume& target, std::size_t most, std::uint64_t seed) {
-  std::vector<std::size_t> bright;
-  for (std::size_t i = 0; i < target.values().size(); ++i)
-    if (target.values()[i] > 0.05F) bright.push_back(i);
-  if (bright.size() > most) {
+/// Samples of the template's brain and of a rim around it: what of the volume lies out there speaks against a pose.
+Points brain_points(const SampledVolume& target, std::size_t most, std::uint64_t seed) {
+  std::vector<float> near = target.values();
+  for (float& value : near) value = std::abs(value);
+  constexpr double kRimVoxels = 1.;
+  near = blurred(std::move(near), target.size(), kRimVoxels);
+  std::vector<std::size_t> chosen;
+  for (std::size_t i = 0; i < near.size(); ++i)
+    if (near[i] > 0.02F) chosen.push_back(i);
+  if (chosen.size() > most) {
     std::mt19937_64 random(seed);  // std::shuffle differs between libraries; this does not
-    for (std::size_t i = 0; i < most; ++i) std::swap(bright[i], bright[i + random() % (bright.size() - i)]);
-    bright.resize(most);
-    std::sort(bright.begin(), bright.end());
+    for (std::size_t i = 0; i < most; ++i) std::swap(chosen[i], chosen[i + random() % (chosen.size() - i)]);
+    chosen.resize(most);
+    std::sort(chosen.begin(), chosen.end());
   }
   Points points;
   const auto n = static_cast<std::size_t>(target.size());
   const double centre = 0.5 * (target.size() - 1);
-  for (const std::size_t i : bright) {
+  for (const std::size_t i : chosen) {
     const Eigen::Vector3d at(static_cast<double>(i % n), static_cast<double>(i / n % n),
                              static_cast<double>(i / n / n));
     points.position.emplace_back(((at.array() - centre) * target.voxel_mm()).matrix().cast<float>());
@@ -222,7 +240,7 @@ std::pair<Candidate, std::optional<Candidate>> search(const SampledVolume& targe
                                                       double log_scale, const TemplateOptions& options) {
   const double distinct = options.distinct_deg * M_PI / 180.;
   const Points points =
-      bright_points(target, static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
+      brain_points(target, static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
   const std::vector<Eigen::Quaterniond> rotations = spread_rotations(options.rotations);
   std::vector<Candidate> tried(rotations.size());
   parallel_chunks(static_cast<std::int64_t>(tried.size()), [&](std::int64_t begin, std::int64_t end) {
@@ -244,7 +262,7 @@ std::pair<Candidate, std::optional<Candidate>> search(const SampledVolume& targe
     if (!known) chosen.push_back(candidate);
   }
   const Points all =
-      bright_points(target, 4 * static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
+      brain_points(target, 4 * static_cast<std::size_t>(options.samples), static_cast<std::uint64_t>(options.seed));
   parallel_tasks(static_cast<std::int64_t>(chosen.size()), [&](std::int64_t i) {
     Candidate& candidate = chosen[static_cast<std::size_t>(i)];
     candidate = refined(all, volume, candidate);
@@ -284,6 +302,8 @@ void validate(const TemplateOptions& options) {
   };
   require(options.voxel_mm >= 1. && options.voxel_mm <= 8., "voxel_mm", options.voxel_mm, "from 1 to 8 mm");
   require(options.blur_mm >= 0. && options.blur_mm <= 20., "blur_mm", options.blur_mm, "from 0 to 20 mm");
+  require(options.wide_blur_mm > options.blur_mm && options.wide_blur_mm <= 50., "wide_blur_mm", options.wide_blur_mm,
+          "above blur_mm, at most 50 mm");
   require(options.rotations >= 24 && options.rotations <= 1000000, "rotations", options.rotations,
           "from 24 to 1,000,000");
   require(options.refined >= 1 && options.refined <= 1000, "refined", options.refined, "from 1 to 1000");

@@ -12,7 +12,7 @@ namespace svort {
 /// poses and matched to the template closest in brain volume.
 ///
 /// @param poses, weights one per slice
-/// @param size_mm edge of the cube that the rough volume fills, around the frame's origin
+/// @param size_mm edge of the cube that the rough volume fills, around the centre of the masks
 /// @return nothing if there is no template, or no brain in the volume; TemplateMatch::sure says whether to trust it
 /// @throws std::invalid_argument naming what does not fit
 std::optional<TemplateMatch> find_canonical_frame(const RegistrationInput& input, const std::vector<Pose>& poses,

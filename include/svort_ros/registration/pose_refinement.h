@@ -98,8 +98,11 @@ void validate(const RefinementOptions& options);
 ///
 /// @param poses, weights one per slice
 /// @param voxel_mm edge of a voxel; the volume is a cube of `size` voxels centred on the frame's origin
+/// @param fading   fade where less was seen than half of what one stack without gaps shows, so that the brain does not
+///                 grow by the width of the PSF
 /// @return size x size x size, float32
 torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::vector<Pose>& poses,
-                                   const std::vector<double>& weights, std::int64_t size, double voxel_mm);
+                                   const std::vector<double>& weights, std::int64_t size, double voxel_mm,
+                                   bool fading = false);
 
 }  // namespace svort

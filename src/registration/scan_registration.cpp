@@ -1,0 +1,130 @@
+#include "svort_ros/registration/scan_registration.h"
+
+#include <torch/types.h>
+
+#include <algorithm>
+#include <cstddef>
+#include <map>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include "rough_volume.h"
+
+namespace svort {
+namespace {
+
+constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
+
+/// One stack by itself.
+struct StackAlone {
+  std::vector<std::size_t> slices;  ///< places in the scan
+  std::vector<Pose> poses;          ///< registered to each other
+  Volume volume;                    ///< empty if they are too few
+  std::size_t group = 0;            ///< stacks of one group have been put together
+};
+
+RegistrationInput part_of(const RegistrationInput& input, const std::vector<std::size_t>& slices) {
+  std::vector<std::int64_t> index(slices.begin(), slices.end());
+  const torch::Tensor select = torch::tensor(index, torch::kInt64);
+  RegistrationInput part;
+  part.slices = input.slices.index_select(0, select);
+  part.masks = input.masks.index_select(0, select);
+  part.resolution_mm = input.resolution_mm;
+  for (const std::size_t i : slices) {
+    part.T_world_slice.push_back(input.T_world_slice[i]);
+    part.stack.push_back(input.stack[i]);
+    part.time_s.push_back(input.time_s[i]);
+    part.thickness_mm.push_back(input.thickness_mm[i]);
+  }
+  return part;
+}
+
+StackAlone stack_alone(const RegistrationInput& input, const std::vector<std::size_t>& slices,
+                       const std::vector<Pose>& start, double size_mm, const RefinementOptions& options,
+                       double voxel_mm) {
+  StackAlone stack;
+  stack.slices = slices;
+  for (const std::size_t i : slices) stack.poses.push_back(start[i]);
+  if (slices.size() < kFewestSlices) return stack;
+  const RegistrationInput part = part_of(input, slices);
+  const Refinement refinement = refine_poses(part, stack.poses, options);
+  std::vector<double> weights;
+  for (std::size_t i = 0; i < slices.size(); ++i) {
+    stack.poses[i] = refinement.slices[i].T_brain_slice;
+    weights.push_back(refinement.slices[i].weight);
+  }
+  Volume volume = rough_volume(part, stack.poses, weights, size_mm, voxel_mm);
+  if (brain_volume_mm3(volume) > 0.) stack.volume = std::move(volume);
+  return stack;
+}
+
+}  // namespace
+
+std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vector<Pose>& start, double size_mm,
+                                  const RefinementOptions& options, const TemplateOptions& match) {
+  validate(input);
+  if (start.size() != input.count())
+    throw std::invalid_argument("assemble_stacks: " + std::to_string(start.size()) + " start poses for " +
+                                std::to_string(input.count()) + " slices");
+  std::map<int, std::vector<std::size_t>> members;
+  for (std::size_t i = 0; i < input.count(); ++i) members[input.stack[i]].push_back(i);
+  if (members.size() < 2) return start;
+  std::vector<StackAlone> stacks;
+  for (const auto& [number, slices] : members)
+    stacks.push_back(stack_alone(input, slices, start, size_mm, options, match.voxel_mm));
+
+  struct Pair {
+    std::size_t a, b;  ///< b comes after a
+    TemplateMatch match;
+  };
+  std::vector<Pair> pairs;
+  for (std::size_t a = 0; a < stacks.size(); ++a)
+    for (std::size_t b = a + 1; b < stacks.size(); ++b)
+      if (!stacks[a].volume.empty() && !stacks[b].volume.empty()) {
+        pairs.push_back({a, b, match_template(stacks[b].volume, {"stack", 0., stacks[a].volume}, match)});
+        if (pairs.back().match.correlation < match.least_correlation) pairs.pop_back();
+      }
+  // The best matches first, each where it joins stacks that are still apart: a spanning tree.
+  std::stable_sort(pairs.begin(), pairs.end(),
+                   [](const Pair& x, const Pair& y) { return x.match.correlation > y.match.correlation; });
+  for (std::size_t i = 0; i < stacks.size(); ++i) stacks[i].group = i;
+  std::vector<Pose> moved(stacks.size(), Pose::Identity());  // each stack, from its own frame into its group's
+  const auto join = [&](std::size_t to, std::size_t from, const Pose& T_to_from) {
+    const Pose T = moved[to] * T_to_from * moved[from].inverse();
+    const std::size_t old = stacks[from].group;
+    for (std::size_t i = 0; i < stacks.size(); ++i) {
+      if (stacks[i].group != old) continue;
+      moved[i] = T * moved[i];
+      stacks[i].group = stacks[to].group;
+    }
+  };
+  for (const Pair& pair : pairs)
+    if (stacks[pair.a].group != stacks[pair.b].group) join(pair.a, pair.b, pair.match.T_template_volume);
+  // Groups that match no other stay to each other as their stacks that follow one another were at the start.
+  for (std::size_t i = 1; i < stacks.size(); ++i)
+    if (stacks[i].group != stacks[i - 1].group) join(i - 1, i, Pose::Identity());
+
+  std::vector<Pose> poses = start;
+  for (std::size_t at = 0; at < stacks.size(); ++at)
+    for (std::size_t i = 0; i < stacks[at].slices.size(); ++i)
+      poses[stacks[at].slices[i]] = moved[at] * stacks[at].poses[i];
+  return poses;
+}
+
+Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
+                         const RefinementOptions& options, const TemplateOptions& match) {
+  if (starts.empty()) throw std::invalid_argument("register_scan: there is no start");
+  Refinement best = refine_poses(input, starts.front(), options);
+  const auto attempt = [&](const std::vector<Pose>& start) {
+    Refinement other = refine_poses(input, start, options);
+    if (other.report.last_cost < best.report.last_cost) best = std::move(other);
+  };
+  for (std::size_t i = 1; i < starts.size(); ++i) attempt(starts[i]);
+  const bool several =
+      std::any_of(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
+  if (several) attempt(assemble_stacks(input, starts.back(), size_mm, options, match));
+  return best;
+}
+
+}  // namespace svort
