@@ -1,6 +1,7 @@
 #include "live_bench.h"
 
 #include <ATen/Parallel.h>
+#include <torch/types.h>
 
 #include <algorithm>
 #include <chrono>
@@ -11,8 +12,12 @@
 #include <stdexcept>
 
 #include "bench_support.h"
+#include "svort_ros/decision/decision_engine.h"
 #include "svort_ros/live/live_pipeline.h"
+#include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/threads.h"
+#include "svort_ros/metrics/pose_error.h"
+#include "svort_ros/registration/pose_refinement.h"
 #include "svort_ros/simulation/brain_volume.h"
 #include "svort_ros/simulation/scan_simulator.h"
 #include "svort_ros/simulation/scan_slices.h"
@@ -23,12 +28,16 @@ const char* const kLiveBenchUsage =
     "       svort_bench live [--slices N,..] [--stacks N] [--threads N] [--full N] [--volumes yes|no] [--seed N]\n"
     "Feeds a simulated scan to the live pipeline (registration) and times each slice: arrival to pose (ms; median, 95 "
     "%\n"
-    "quantile and largest since the first slice), the mean of the last 15, and arrival to volume.\n"
+    "quantile and largest since the first slice), the mean of the last 15, arrival to volume and to the decisions "
+    "(head\n"
+    "motion, slice quality, coverage, reacquisition) that follow it. Ratios compare with registering all slices again\n"
+    "per arrival from the last poses (full_over_this) and from the scanner's poses, as at the end of a scan\n"
+    "(rerun_over_this). Last line: how far the poses of both updates are from each other once the scan has ended.\n"
     "  --slices   kept slices at which a line is printed, default 15,45,90,450\n"
     "  --stacks   stacks per scan, 1 to 6, default 3; scans follow one another as stacks of one scan\n"
     "  --threads  default: all cores\n"
     "  --full     run the same with all slices registered again per arrival, up to so many slices; default 90\n"
-    "  --volumes  also estimate the volume after each slice, default yes\n"
+    "  --volumes  also estimate the volume and decide after each slice, default yes\n"
     "  --seed     of the simulated scan, default 1\n";
 
 namespace {
@@ -125,14 +134,28 @@ double milliseconds_since(Clock::time_point start) {
   return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
 }
 
-/// @param baseline_ms of the other update at the same number of slices, mean of the last 15; empty: none
-/// @return mean of the last 15 at each entry of options.slices that was reached
-std::vector<double> run(const Options& options, const std::string& update, const std::vector<double>& baseline_ms) {
+/// What the other update needed at each entry of options.slices that it reached.
+struct Baseline {
+  std::vector<double> last_15_ms;  ///< mean of the last 15 arrivals
+  std::vector<double> rerun_ms;    ///< registering all slices from the scanner's poses
+};
+
+double rerun_ms(const LivePipeline& pipeline) {
+  const RegistrationInput input = registration_input(pipeline.sequence());
+  const Clock::time_point start = Clock::now();
+  refine_poses(input, input.T_world_slice, PipelineOptions().estimator.registration);
+  return milliseconds_since(start);
+}
+
+/// @param baseline of the other update; empty: none
+Baseline run(const Options& options, const std::string& update, const Baseline& baseline) {
   PipelineOptions pipeline_options;
   pipeline_options.estimator.update = update;
   LivePipeline pipeline(pipeline_options);
+  DecisionEngine decisions{DecisionOptions()};
   Slices slices(options);
-  std::vector<double> pose_ms, volume_ms, recent_means;
+  std::vector<double> pose_ms, volume_ms, decision_ms;
+  Baseline measured;
   const bool full = update == "full";
   const std::int64_t last = full ? std::min(options.full, options.slices.back()) : options.slices.back();
   for (const std::int64_t count : options.slices) {
@@ -145,11 +168,14 @@ std::vector<double> run(const Options& options, const std::string& update, const
       if (!options.volumes) continue;
       pipeline.update_volume();
       volume_ms.push_back(milliseconds_since(arrived));
+      decisions.update(pipeline);
+      decision_ms.push_back(milliseconds_since(arrived));
     }
     const auto recent = pose_ms.end() - std::min<std::ptrdiff_t>(15, static_cast<std::ptrdiff_t>(pose_ms.size()));
     double mean = 0.;
     for (auto ms = recent; ms != pose_ms.end(); ++ms) mean += *ms / static_cast<double>(pose_ms.end() - recent);
-    recent_means.push_back(mean);
+    measured.last_15_ms.push_back(mean);
+    const std::size_t at = measured.last_15_ms.size() - 1;
     std::cout << R"({"benchmark": "live", "update": ")" << update << R"(", "slices": )" << count
               << R"(, "stacks_per_scan": )" << options.stacks << R"(, "threads": )" << options.threads
               << R"(, "pose_ms_median": )" << quantile(pose_ms, 0.5) << R"(, "pose_ms_p95": )"
@@ -157,13 +183,41 @@ std::vector<double> run(const Options& options, const std::string& update, const
               << R"(, "pose_ms_last_15": )" << mean;
     if (options.volumes)
       std::cout << R"(, "volume_ms_median": )" << quantile(volume_ms, 0.5) << R"(, "volume_ms_p95": )"
-                << quantile(volume_ms, 0.95);
-    if (recent_means.size() <= baseline_ms.size())
-      std::cout << R"(, "full_over_this": )" << baseline_ms[recent_means.size() - 1] / mean;
+                << quantile(volume_ms, 0.95) << R"(, "decision_ms_median": )" << quantile(decision_ms, 0.5)
+                << R"(, "decision_ms_p95": )" << quantile(decision_ms, 0.95);
+    if (full) measured.rerun_ms.push_back(rerun_ms(pipeline));
+    if (full) std::cout << R"(, "rerun_ms": )" << measured.rerun_ms.back();
+    if (at < baseline.last_15_ms.size())
+      std::cout << R"(, "full_over_this": )" << baseline.last_15_ms[at] / mean << R"(, "rerun_over_this": )"
+                << baseline.rerun_ms[at] / mean;
     std::cout << R"(, "peak_memory_mb": )" << peak_memory_mb() << R"(, "cpu": ")" << processor() << R"("})"
               << std::endl;
   }
-  return recent_means;
+  return measured;
+}
+
+torch::Tensor final_poses(const Options& options, const std::string& update, std::int64_t count) {
+  PipelineOptions pipeline_options;
+  pipeline_options.estimator.update = update;
+  pipeline_options.estimator.final_volume.passes = 0;  // poses are what is compared
+  LivePipeline pipeline(pipeline_options);
+  Slices slices(options);
+  for (std::int64_t kept = 0; kept < count;)
+    if (is_kept(pipeline.add(slices.next()).status)) ++kept;
+  pipeline.finalise();
+  std::vector<Pose> poses;
+  for (const SliceEstimate& slice : pipeline.estimate().slices) poses.push_back(slice.T_brain_slice);
+  return poses_tensor(poses);
+}
+
+/// Whether what was gained while the scan ran costs anything at its end.
+void compare_ends(const Options& options) {
+  const std::int64_t count = std::min(options.full, options.slices.back());
+  const PoseErrors difference = relative_pose_errors(final_poses(options, "incremental", count),
+                                                     final_poses(options, "full", count), AnchorFrame());
+  std::cout << R"({"benchmark": "live", "slices": )" << count << R"(, "final_difference_mm": )"
+            << summarise(difference.ed).mean << R"(, "final_difference_deg": )"
+            << summarise(difference.gd).mean * 180. / M_PI << "}" << std::endl;
 }
 
 }  // namespace
@@ -171,8 +225,9 @@ std::vector<double> run(const Options& options, const std::string& update, const
 void run_live_bench(const std::vector<std::string>& arguments) {
   const Options options = parse(arguments);
   set_thread_count(static_cast<int>(options.threads));
-  const std::vector<double> full_ms = run(options, "full", {});
-  run(options, "incremental", full_ms);
+  const Baseline full = run(options, "full", {});
+  run(options, "incremental", full);
+  compare_ends(options);
 }
 
 }  // namespace svort

@@ -22,6 +22,21 @@ struct Answer {
   bool canonical = false;  ///< the frame is the canonical one without a template
 };
 
+/// How the brain frame moved between two estimates: the motion that all slices of the first share.
+Pose frame_motion(const std::vector<SliceEstimate>& before, const std::vector<SliceEstimate>& after) {
+  std::vector<Pose> old_poses, new_poses;
+  for (const SliceEstimate& slice : before) {
+    const auto same = std::find_if(after.begin(), after.end(), [&](const SliceEstimate& other) {
+      return other.info.stack == slice.info.stack && other.info.index == slice.info.index;
+    });
+    if (same == after.end()) continue;
+    old_poses.push_back(slice.T_brain_slice);
+    new_poses.push_back(same->T_brain_slice);
+  }
+  return old_poses.empty() ? Pose::Identity()
+                           : global_alignment(poses_tensor(old_poses), poses_tensor(new_poses), kEvaluationFrame);
+}
+
 }  // namespace
 
 AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& method, const AccuracySetup& setup) {
@@ -48,6 +63,8 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   Answer answer;
   std::vector<Pose> published;
   std::vector<Pose> published_truth;
+  std::vector<SliceEstimate> before;
+  std::uint64_t frame_revision = 0;
   const Stopwatch whole;
   for (std::size_t i = 0; i < scan.slices.size(); ++i) {
     const Stopwatch arrival;
@@ -57,6 +74,13 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     const double ms = 1e3 * arrival.seconds();
     const std::size_t count = pipeline.estimate().slices.size();
     if (count >= 80) latency_ms.push_back(ms);
+    // Where the brain frame was moved, and said so, what was published before moves with it.
+    if (pipeline.estimate().frame_revision != frame_revision && !published.empty()) {
+      const Pose T_new_old = frame_motion(before, pipeline.estimate().slices);
+      for (Pose& pose : published) pose = T_new_old * pose;
+    }
+    frame_revision = pipeline.estimate().frame_revision;
+    before = pipeline.estimate().slices;
     if (pipeline.newest()->info.stack >= 1) {
       published.push_back(pipeline.newest()->T_brain_slice);
       published_truth.push_back(scan.truth[i]);
@@ -86,11 +110,12 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   if (method.refined || method.source == PoseSource::stacks || method.source == PoseSource::registration) {
     RefinementOptions refinement = options.estimator.registration;
     if (method.source == PoseSource::stacks) refinement.trajectory_passes = 0;
+    const std::vector<Pose> start = crops;
     // From the scanner's poses the stacks may be anywhere; from a network's or for the stack stage, these poses count.
     const Refinement refined = method.source == PoseSource::registration
-                                   ? register_scan(input, {crops}, options.estimator.volume_size_mm, refinement,
+                                   ? register_scan(input, {start}, options.estimator.volume_size_mm, refinement,
                                                    options.estimator.template_match)
-                                   : refine_poses(input, crops, refinement);
+                                   : refine_poses(input, start, refinement);
     crops.clear();
     for (std::size_t i = 0; i < row.slices; ++i) {
       crops.push_back(refined.slices[i].T_brain_slice);

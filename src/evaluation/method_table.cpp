@@ -68,7 +68,7 @@ Answer network_answer(const PartOfScan& part, const TableMethod& method, const E
   const SequenceInput prepared = network_input(part.sequence, method.network->network().common_frame);
   NetworkRun run;
   run.iterations = method.iterations;
-  run.formulation = acquisition_formulation(options.formulation);
+  run.formulation = acquisition_formulation(options.network.formulation);
   NetworkGrid grid;
   // Versions 1 and 2 look at this volume; for the live network it is only a result, which is not used here.
   grid.resolution_mm = method.network->network().name == "live" ? 2. : options.network.volume_resolution_mm;

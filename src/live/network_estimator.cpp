@@ -29,6 +29,14 @@ bool runs_at_every_arrival(const NetworkEstimatorOptions& options) {
   throw std::invalid_argument("estimator.network.when is '" + options.when + "'; known: scan_end, every_arrival");
 }
 
+AcquisitionFormulation formulation_of(const NetworkEstimatorOptions& options) {
+  try {
+    return acquisition_formulation(options.formulation);
+  } catch (const std::invalid_argument& error) {
+    throw std::invalid_argument(std::string("estimator.network.formulation: ") + error.what());
+  }
+}
+
 RunnerOptions runner_options(const NetworkEstimatorOptions& options) { return {options.device, options.precision}; }
 
 NetworkGrid network_grid(const EstimatorOptions& options) {
@@ -55,7 +63,7 @@ NetworkEstimator::NetworkEstimator(const EstimatorOptions& options, NetworkInsta
       every_arrival_(runs_at_every_arrival(options.network)),
       iterations_(options.network.iterations),
       grid_(network_grid(options)),
-      formulation_(acquisition_formulation(options.formulation)),
+      formulation_(formulation_of(options.network)),
       runner_(std::move(network), runner_options(options.network)),
       weights_sha256_(about.sha256),
       untrained_(is_untrained(about.provenance)) {

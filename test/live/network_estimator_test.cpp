@@ -25,9 +25,9 @@ using svort_test::SyntheticScanOptions;
 /// Answers the transforms that it is given, moved by `change`.
 class EchoNetwork : public PoseNetwork {
  public:
-  std::vector<NetworkStep> run(const NetworkInput& input, const NetworkGrid& /*grid*/,
-                               const NetworkRun& /*run*/) override {
+  std::vector<NetworkStep> run(const NetworkInput& input, const NetworkGrid& /*grid*/, const NetworkRun& run) override {
     last = input;
+    formulation = run.formulation;
     NetworkStep step;
     step.transforms = compose_transforms(change.expand({input.transforms.size(0), 3, 4}), input.transforms);
     step.weights = torch::full({input.transforms.size(0)}, 0.5F);
@@ -35,6 +35,7 @@ class EchoNetwork : public PoseNetwork {
   }
   torch::Tensor change = axisangle_to_matrix(torch::tensor({{.3F, -.2F, .1F, 4.F, 5.F, 6.F}}));
   NetworkInput last;
+  AcquisitionFormulation formulation = AcquisitionFormulation::fast;
 };
 
 EstimatorOptions small_options() {
@@ -109,6 +110,24 @@ TEST_P(EchoEstimator, TheVolumeFollowsThePoses) {
   }
   EXPECT_TRUE(estimator.estimate().final);
   EXPECT_FALSE(estimator.volume().empty());
+}
+
+TEST_P(EchoEstimator, TheNetworkHasAForwardModelOfItsOwn) {
+  EstimatorOptions options = small_options();
+  ASSERT_EQ(options.formulation, "fast");
+  {
+    NetworkEstimator estimator(options, network(), {});
+    SliceSequence sequence;
+    feed(estimator, sequence);
+    estimator.finalise(sequence);
+    EXPECT_EQ(echo->formulation, AcquisitionFormulation::exact) << "as the networks were trained";
+  }
+  options.network.formulation = "fast";
+  NetworkEstimator estimator(options, network(), {});
+  SliceSequence sequence;
+  feed(estimator, sequence);
+  estimator.finalise(sequence);
+  EXPECT_EQ(echo->formulation, AcquisitionFormulation::fast);
 }
 
 TEST_P(EchoEstimator, RunsCausallyAtEveryArrival) {
@@ -253,6 +272,10 @@ TEST_F(NetworkMethod, NamesTheOptionThatIsWrong) {
   options_.estimator.network.iterations = 0;
   options_.estimator.network.volume_resolution_mm = 0.;
   EXPECT_NE(error().find("estimator.network.volume_resolution_mm is 0"), std::string::npos) << error();
+  options_.estimator.network.volume_resolution_mm = 4.;
+  options_.estimator.network.formulation = "rough";
+  EXPECT_NE(error().find("estimator.network.formulation: "), std::string::npos) << error();
+  options_.estimator.network.formulation = "exact";
   options_.estimator.network.weights = (folder_ / "none.pt").string();
   EXPECT_NE(error().find("none.pt: cannot be read"), std::string::npos) << error();
   options_.estimator.network.weights.clear();

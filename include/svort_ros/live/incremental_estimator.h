@@ -62,6 +62,9 @@ struct NetworkEstimatorOptions {
   std::string device = "auto";        ///< "cpu", "cuda", or whichever there is
   std::string precision = "float32";  ///< "tf32" and "bfloat16" are faster on new GPUs, and coarser
   int iterations = 0;                 ///< transformation updates; 0: as many as the network was made for
+  /// Of the forward model inside the network. "fast" moves the poses of version 2 by up to 0.4 mm
+  /// (docs/performance.md).
+  std::string formulation = "exact";
   /// Of the volume that the network sees. Versions 1 and 2 of SVoRT were trained at 0.8 mm.
   double volume_resolution_mm = 0.8;
 
@@ -73,6 +76,7 @@ struct NetworkEstimatorOptions {
     v("device", device, "auto (a GPU if there is one), cpu or cuda");
     v("precision", precision, "float32, tf32 (GPU only) or bfloat16: faster and coarser in this order");
     v("iterations", iterations, "transformation updates; 0: as many as the network was made for");
+    v("formulation", formulation, "forward model inside the network: exact, or fast, which changes its poses a little");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume that the network sees, mm");
   }
 };
