@@ -7,30 +7,15 @@
 #include <memory>
 #include <stdexcept>
 
+#include "evaluation_fixture.h"
 #include "svort_ros/geometry/anchor_points.h"
 #include "svort_ros/geometry/rigid_transform.h"
 
 namespace svort {
 namespace {
 
-BrainVolume small_brain() {
-  PhantomOptions options;
-  options.length_mm = 60.;
-  BrainVolume brain = make_phantom(options);
-  brain.name = "phantom";
-  return brain;
-}
-
-AccuracySetup quick_setup() {
-  AccuracySetup setup;
-  EstimatorOptions& estimator = setup.pipeline.estimator;
-  setup.pipeline.sequence.size_px = 64;
-  setup.pipeline.sequence.resolution_mm = 2.;
-  estimator.registration.finest_mm = 2.;
-  estimator.volume_resolution_mm = estimator.final_volume.resolution_mm = 2.;
-  estimator.final_volume.passes = 1;
-  return setup;
-}
+using svort_test::quick_setup;
+using svort_test::small_brain;
 
 EvaluationScan moving_scan() {
   EvaluationScanOptions options;
