@@ -30,6 +30,7 @@ struct LevelPlan {
   double pixel_mm, blur_mm;
   int passes;
   bool per_stack;
+  SliceContent content = SliceContent::inside;
 };
 
 /// One run of refine_poses().
@@ -50,17 +51,21 @@ class Refiner {
 
   Refinement run(RefinementEffort effort) {
     // Coarse to fine; the volume is blurred as the slices are. The coarsest level catches motions of centimetres.
+    // Blurred that much, the inside of a brain alone looks alike everywhere, and poses drift; its outline holds them.
+    // The finer levels do without, because masks are as wrong as segmentations are.
     const double middle = std::max(2., options_.finest_mm), coarse = 2. * middle;
     const int passes = options_.trajectory_passes;
-    std::vector<LevelPlan> plan = {{coarse, 1.5 * coarse, options_.stack_passes, true},
-                                   {coarse, 1.5 * coarse, 2 * passes, false},
-                                   {middle, 2. * middle, options_.stack_passes, true},
-                                   {middle, 2. * middle, passes + 1, false},
+    std::vector<LevelPlan> plan = {{coarse, 1.5 * coarse, options_.stack_passes, true, SliceContent::outline},
+                                   {coarse, 1.5 * coarse, 2 * passes, false, SliceContent::outline},
+                                   {middle, 2. * middle, options_.stack_passes, true, SliceContent::outline},
+                                   {middle, 2. * middle, passes + 1, false, SliceContent::outline},
                                    {middle, middle, passes, false},
                                    {middle, 0.5 * middle, passes, false}};
     if (options_.finest_mm < middle) plan.push_back({options_.finest_mm, 0., passes, false});
     if (effort == RefinementEffort::warm)
-      plan = {{middle, 2. * middle, 1, true}, {middle, middle, 1, false}, {middle, 0.5 * middle, 1, false}};
+      plan = {{middle, 2. * middle, 1, true, SliceContent::outline},
+              {middle, middle, 1, false},
+              {middle, 0.5 * middle, 1, false}};
     for (const LevelPlan& level : plan)
       if (level.passes > 0) run_level(level);
 
@@ -75,7 +80,7 @@ class Refiner {
  private:
   void run_level(const LevelPlan& plan) {
     if (plan.pixel_mm != level_pixel_ || plan.blur_mm != level_blur_) {
-      level_ = make_level(input_, plan.pixel_mm, plan.blur_mm);
+      level_ = make_level(input_, plan.pixel_mm, plan.blur_mm, plan.content);
       level_pixel_ = plan.pixel_mm;
       level_blur_ = plan.blur_mm;
     }

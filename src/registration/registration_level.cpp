@@ -10,6 +10,9 @@
 namespace svort {
 namespace {
 
+// The rim of the outline reaches to where the blurred mask has fallen to this: 1.6 standard deviations.
+constexpr float kRimShare = 0.05F;
+
 [[noreturn]] void reject(const std::string& what) { throw std::invalid_argument("registration: " + what); }
 
 torch::Tensor gaussian_kernel(double sigma) {
@@ -51,7 +54,7 @@ void validate(const RegistrationInput& input) {
   if (!torch::isfinite(input.slices).all().item<bool>()) reject("slices hold NaN or infinity");
 }
 
-RegistrationLevel make_level(const RegistrationInput& input, double pixel_mm, double blur_mm) {
+RegistrationLevel make_level(const RegistrationInput& input, double pixel_mm, double blur_mm, SliceContent content) {
   const torch::NoGradGuard no_grad;
   auto factor = std::max<std::int64_t>(1, std::llround(pixel_mm / input.resolution_mm));
   const auto divides = [&](std::int64_t size) { return size >= factor && size % factor % 2 == 0; };
@@ -72,9 +75,13 @@ RegistrationLevel make_level(const RegistrationInput& input, double pixel_mm, do
   }
   level.masks = share >= 0.5;
   if (blur_mm > 0.1 * level.pixel_mm) {
-    // Only the brain is averaged: what lies outside the mask is unknown, not dark.
     sums = blurred_in_plane(sums, blur_mm / level.pixel_mm);
     share = blurred_in_plane(share, blur_mm / level.pixel_mm);
+  }
+  if (content == SliceContent::outline) {
+    // Slices without any brain pixel have no outline either.
+    level.masks = (share >= kRimShare).logical_and(level.masks.flatten(1).any(1).view({-1, 1, 1, 1}));
+    share.fill_(1.F);
   }
   level.slices = torch::where(level.masks, sums / share.clamp_min(1e-6), torch::zeros_like(sums)).contiguous();
   level.masks = level.masks.contiguous();

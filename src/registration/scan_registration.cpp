@@ -4,17 +4,24 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <limits>
 #include <map>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
 #include "rough_volume.h"
+#include "scan_pieces.h"
 
 namespace svort {
 namespace {
 
 constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
+
+constexpr int kPieceSlices = 8, kShortPieceSlices = 5;
+constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
+constexpr double kAgreed = 0.9;  // pieces that correlate like this are in their places: nothing to search for
+constexpr double kRestlessTrust = 4.;
 
 /// One stack by itself.
 struct StackAlone {
@@ -23,6 +30,12 @@ struct StackAlone {
   Volume volume;                    ///< empty if they are too few
   std::size_t group = 0;            ///< stacks of one group have been put together
 };
+
+std::vector<Pose> poses_of(const Refinement& refinement) {
+  std::vector<Pose> poses;
+  for (const RefinedSlice& slice : refinement.slices) poses.push_back(slice.T_brain_slice);
+  return poses;
+}
 
 RegistrationInput part_of(const RegistrationInput& input, const std::vector<std::size_t>& slices) {
   std::vector<std::int64_t> index(slices.begin(), slices.end());
@@ -115,15 +128,42 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
                          const RefinementOptions& options, const TemplateOptions& match) {
   if (starts.empty()) throw std::invalid_argument("register_scan: there is no start");
-  Refinement best = refine_poses(input, starts.front(), options);
-  const auto attempt = [&](const std::vector<Pose>& start) {
-    Refinement other = refine_poses(input, start, options);
-    if (other.report.last_cost < best.report.last_cost) best = std::move(other);
-  };
-  for (std::size_t i = 1; i < starts.size(); ++i) attempt(starts[i]);
   const bool several =
       std::any_of(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
-  if (several) attempt(assemble_stacks(input, starts.back(), size_mm, options, match));
+  if (!several) {
+    // The pieces of one stack hardly meet: what is left is the cost.
+    Refinement best = refine_poses(input, starts.front(), options);
+    for (std::size_t i = 1; i < starts.size(); ++i) {
+      Refinement other = refine_poses(input, starts[i], options);
+      if (other.report.last_cost < best.report.last_cost) best = std::move(other);
+    }
+    return best;
+  }
+  validate(input);
+  const double judged_mm = std::max(2., options.finest_mm);
+  const ScanPieces judge(input, kPieceSlices, judged_mm, judged_mm);
+  Refinement best;
+  double agreement = -std::numeric_limits<double>::infinity();
+  const auto attempt = [&](const std::vector<Pose>& start, const RefinementOptions& with) {
+    Refinement other = refine_poses(input, start, with);
+    const double other_agreement = judge.agreement(poses_of(other));
+    if (other_agreement <= agreement) return;
+    best = std::move(other);
+    agreement = other_agreement;
+  };
+  for (const std::vector<Pose>& start : starts) attempt(start, options);
+  attempt(assemble_stacks(input, starts.back(), size_mm, options, match), options);
+
+  const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
+  if (pieces.agreement(poses_of(best)) >= kAgreed) return best;
+  const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
+  attempt(pieces.search(poses_of(best)), options);
+  attempt(pieces.search(starts.back()), options);
+  attempt(short_pieces.search(poses_of(best)), options);
+  // A head that jumps like this is restless between its jumps, too.
+  RefinementOptions restless = options;
+  restless.image_trust = std::min(1., kRestlessTrust * options.image_trust);
+  attempt(poses_of(best), restless);
   return best;
 }
 

@@ -11,6 +11,7 @@
 #include <stdexcept>
 
 #include "../acquisition/parallel.h"
+#include "rotation_grid.h"
 #include "sampled_volume.h"
 #include "slice_terms.h"
 
@@ -95,20 +96,6 @@ SampledVolume centred(const Volume& volume, const Shape& shape, const TemplateOp
   const std::vector<float> wide = blurred(std::move(sums), size, options.wide_blur_mm / options.voxel_mm);
   for (std::size_t i = 0; i < structure.size(); ++i) structure[i] -= wide[i];
   return SampledVolume(std::move(structure), size, options.voxel_mm);
-}
-
-/// Rotations spread evenly and deterministically over SO(3): a spiral on the 3-sphere whose two angles advance by
-/// irrational steps (super-Fibonacci sampling, Alexa, CVPR 2022).
-std::vector<Eigen::Quaterniond> spread_rotations(int count) {
-  constexpr double kPhi = 1.41421356237309504880, kPsi = 1.533751168755204288118041;
-  std::vector<Eigen::Quaterniond> rotations;
-  for (int i = 0; i < count; ++i) {
-    const double s = i + 0.5, t = s / count;
-    const double r = std::sqrt(t), big = std::sqrt(1. - t);
-    const double alpha = 2. * M_PI * s / kPhi, beta = 2. * M_PI * s / kPsi;
-    rotations.emplace_back(big * std::cos(beta), r * std::sin(alpha), r * std::cos(alpha), big * std::sin(beta));
-  }
-  return rotations;
 }
 
 struct Candidate {
