@@ -24,6 +24,7 @@ constexpr std::size_t kRefined = 6;
 constexpr double kDistinctRad = 0.35;
 // A piece goes elsewhere only if it fits better there by this: not for noise.
 constexpr double kMargin = 0.01;
+constexpr double kSliceMargin = 0.02;  // the same for a slice by itself
 constexpr double kLeverMm = 40., kLargestStepMm = 6., kSmallStepMm = 0.2;
 constexpr int kSteps = 8;
 constexpr double kImageScale = 0.12;  // as RefinementOptions
@@ -137,10 +138,10 @@ Eigen::Vector3d ScanPieces::centre_of(std::size_t piece, const std::vector<Pose>
   return brightness > 0. ? Eigen::Vector3d(sum / brightness) : Eigen::Vector3d(Eigen::Vector3d::Zero());
 }
 
-double ScanPieces::correlation(std::size_t piece, const std::vector<Pose>& poses, const Pose& motion,
-                               const SampledVolume& volume, std::size_t stride) const {
+double ScanPieces::correlation(const std::vector<std::size_t>& slices, const std::vector<Pose>& poses,
+                               const Pose& motion, const SampledVolume& volume, std::size_t stride) const {
   Correlation correlation;
-  for (const std::size_t i : pieces_[piece]) {
+  for (const std::size_t i : slices) {
     const Eigen::Affine3f pose = (motion * poses[i]).cast<float>();
     const SlicePoints& points = level_.points[i];
     for (std::size_t k = 0; k < points.value.size(); k += stride) {
@@ -181,16 +182,44 @@ Pose ScanPieces::refined(std::size_t piece, const std::vector<Pose>& poses, Pose
   return motion_of_piece;
 }
 
+Pose ScanPieces::head(std::size_t slice, const std::vector<Pose>& poses) const {
+  return poses[slice] * input_.T_world_slice[slice].inverse();
+}
+
+void ScanPieces::share_out(std::size_t piece, std::vector<Seen>* seen, std::vector<Pose>* poses) const {
+  Eigen::Vector3d centre;
+  const SampledVolume volume = others(*seen, piece, &centre);
+  std::vector<Pose> heads;
+  if (piece > 0) heads.push_back(head(pieces_[piece - 1].front(), *poses));
+  if (piece + 1 < pieces_.size()) heads.push_back(head(pieces_[piece + 1].back(), *poses));
+  bool moved = false;
+  for (const std::size_t i : pieces_[piece]) {
+    const Pose here = head(i, *poses);
+    double best = correlation({i}, *poses, Pose::Identity(), volume, 1) + kSliceMargin;
+    Pose motion_of_slice = Pose::Identity();
+    for (const Pose& other : heads) {
+      const Pose there = other * here.inverse();
+      const double fits = correlation({i}, *poses, there, volume, 1);
+      if (fits <= best) continue;
+      best = fits;
+      motion_of_slice = there;
+      moved = true;
+    }
+    (*poses)[i] = motion_of_slice * (*poses)[i];
+  }
+  if (!moved) return;
+  const double before = (*seen)[piece].correlation;
+  (*seen)[piece] = see(piece, *poses);
+  (*seen)[piece].correlation = before;
+}
+
 void ScanPieces::place(std::size_t piece, std::vector<Seen>* seen, std::vector<Pose>* poses) const {
   Eigen::Vector3d centre;
   const SampledVolume volume = others(*seen, piece, &centre);
   std::vector<Pose> tried;
-  const auto head = [&](std::size_t of_piece) -> Pose {
-    const std::size_t first = pieces_[of_piece].front();
-    return (*poses)[first] * input_.T_world_slice[first].inverse();
-  };
-  if (piece > 0) tried.push_back(head(piece - 1) * head(piece).inverse());
-  if (piece + 1 < pieces_.size()) tried.push_back(head(piece + 1) * head(piece).inverse());
+  const Pose here = head(pieces_[piece].front(), *poses);
+  if (piece > 0) tried.push_back(head(pieces_[piece - 1].front(), *poses) * here.inverse());
+  if (piece + 1 < pieces_.size()) tried.push_back(head(pieces_[piece + 1].front(), *poses) * here.inverse());
   static const std::vector<Eigen::Quaterniond> turns = rotations_within_reach();
   const Eigen::Vector3d own_centre = centre_of(piece, *poses);
   for (const Eigen::Quaterniond& rotation : turns) {
@@ -206,7 +235,7 @@ void ScanPieces::place(std::size_t piece, std::vector<Seen>* seen, std::vector<P
   std::vector<Candidate> candidates(tried.size());
   parallel_tasks(static_cast<std::int64_t>(tried.size()), [&](std::int64_t task) {
     const auto k = static_cast<std::size_t>(task);
-    candidates[k] = {tried[k], correlation(piece, *poses, tried[k], volume, 2)};
+    candidates[k] = {tried[k], correlation(pieces_[piece], *poses, tried[k], volume, 2)};
   });
   std::stable_sort(candidates.begin(), candidates.end(),
                    [](const Candidate& a, const Candidate& b) { return a.correlation > b.correlation; });
@@ -221,7 +250,7 @@ void ScanPieces::place(std::size_t piece, std::vector<Seen>* seen, std::vector<P
   parallel_tasks(static_cast<std::int64_t>(chosen.size()), [&](std::int64_t task) {
     Candidate& candidate = chosen[static_cast<std::size_t>(task)];
     candidate.motion = refined(piece, *poses, candidate.motion, volume);
-    candidate.correlation = correlation(piece, *poses, candidate.motion, volume, 1);
+    candidate.correlation = correlation(pieces_[piece], *poses, candidate.motion, volume, 1);
   });
   const Candidate* best = &chosen.front();
   for (const Candidate& candidate : chosen)
@@ -247,8 +276,10 @@ std::vector<Pose> ScanPieces::search(std::vector<Pose> poses) const {
   const Eigen::Vector3d shift = given.front().translation() - poses.front().translation();
   std::vector<Seen> seen;
   for (std::size_t piece = 0; piece < pieces_.size(); ++piece) seen.push_back(see(piece, poses));
-  for (int sweep = 0; sweep < kSweeps; ++sweep)
+  for (int sweep = 0; sweep < kSweeps; ++sweep) {
     for (std::size_t piece = 0; piece < pieces_.size(); ++piece) place(piece, &seen, &poses);
+    for (std::size_t piece = 0; piece < pieces_.size(); ++piece) share_out(piece, &seen, &poses);
+  }
   // Slices without brain go along with those before them.
   std::size_t last = pieces_.front().front();
   for (std::size_t i = 0; i < poses.size(); ++i) {
@@ -273,7 +304,7 @@ double ScanPieces::agreement(const std::vector<Pose>& given) const {
     const SampledVolume volume = others(seen, piece, &centre);
     double count = 0.;
     for (const std::size_t i : pieces_[piece]) count += static_cast<double>(level_.points[i].value.size());
-    sum += count * correlation(piece, poses, Pose::Identity(), volume, 1);
+    sum += count * correlation(pieces_[piece], poses, Pose::Identity(), volume, 1);
     pixels += count;
   }
   return sum / pixels;

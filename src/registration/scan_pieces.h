@@ -43,10 +43,15 @@ class ScanPieces {
   /// The volume of all pieces but one, and its centre of brightness.
   SampledVolume others(const std::vector<Seen>& seen, std::size_t piece, Eigen::Vector3d* centre) const;
   Eigen::Vector3d centre_of(std::size_t piece, const std::vector<Pose>& poses) const;
-  double correlation(std::size_t piece, const std::vector<Pose>& poses, const Pose& motion, const SampledVolume& volume,
-                     std::size_t stride) const;
+  double correlation(const std::vector<std::size_t>& slices, const std::vector<Pose>& poses, const Pose& motion,
+                     const SampledVolume& volume, std::size_t stride) const;
   Pose refined(std::size_t piece, const std::vector<Pose>& poses, Pose motion, const SampledVolume& volume) const;
+  /// How the head had moved at this slice, T_brain_scanner.
+  Pose head(std::size_t slice, const std::vector<Pose>& poses) const;
+  /// One motion for the whole piece.
   void place(std::size_t piece, std::vector<Seen>* seen, std::vector<Pose>* poses) const;
+  /// The head may have jumped within the piece: slices that fit better where the piece before or after is go there.
+  void share_out(std::size_t piece, std::vector<Seen>* seen, std::vector<Pose>* poses) const;
 
   const RegistrationInput& input_;
   RegistrationLevel level_;

@@ -20,8 +20,11 @@ constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
 
 constexpr int kPieceSlices = 8, kShortPieceSlices = 5;
 constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
-constexpr double kAgreed = 0.9;  // pieces that correlate like this are in their places: nothing to search for
-constexpr double kRestlessTrust = 4.;
+constexpr double kJudgedMm = 2.;
+// Of agreement: what is no better than this is noise.
+constexpr double kBetter = 0.001, kBolder = 0.01;
+// Pieces that correlate like this, blurred and sharp, are in their places: there is nothing to search for.
+constexpr double kAgreed = 0.9, kAgreedSharp = 0.78;
 
 /// One stack by itself.
 struct StackAlone {
@@ -140,30 +143,49 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
     return best;
   }
   validate(input);
-  const double judged_mm = std::max(2., options.finest_mm);
-  const ScanPieces judge(input, kPieceSlices, judged_mm, judged_mm);
+  // What is tried is judged without the finest level, which costs the most and moves slices the least.
+  RefinementOptions calm = options;
+  calm.finest_mm = std::max(kJudgedMm, options.finest_mm);
+  const ScanPieces judge(input, kPieceSlices, calm.finest_mm, calm.finest_mm);
   Refinement best;
+  RefinementOptions best_options;
   double agreement = -std::numeric_limits<double>::infinity();
   const auto attempt = [&](const std::vector<Pose>& start, const RefinementOptions& with) {
     Refinement other = refine_poses(input, start, with);
     const double other_agreement = judge.agreement(poses_of(other));
-    if (other_agreement <= agreement) return;
+    // Poses that follow the images more agree a little better by following their noise.
+    const bool bolder = with.image_trust > best_options.image_trust;
+    if (!best.slices.empty() && other_agreement < agreement + (bolder ? kBolder : kBetter)) return;
     best = std::move(other);
+    best_options = with;
     agreement = other_agreement;
   };
-  for (const std::vector<Pose>& start : starts) attempt(start, options);
-  attempt(assemble_stacks(input, starts.back(), size_mm, options, match), options);
+  for (const std::vector<Pose>& start : starts) attempt(start, calm);
+  attempt(assemble_stacks(input, starts.back(), size_mm, calm, match), calm);
+
+  // A head that jumps is restless between its jumps, too: its images count more, its smooth motion less.
+  const auto restless = [&](double factor) {
+    RefinementOptions with = calm;
+    with.image_trust = std::min(1., factor * options.image_trust);
+    return with;
+  };
+  attempt(poses_of(best), restless(4.));
 
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
-  if (pieces.agreement(poses_of(best)) >= kAgreed) return best;
-  const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
-  attempt(pieces.search(poses_of(best)), options);
-  attempt(pieces.search(starts.back()), options);
-  attempt(short_pieces.search(poses_of(best)), options);
-  // A head that jumps like this is restless between its jumps, too.
-  RefinementOptions restless = options;
-  restless.image_trust = std::min(1., kRestlessTrust * options.image_trust);
-  attempt(poses_of(best), restless);
+  if (pieces.agreement(poses_of(best)) < kAgreed || agreement < kAgreedSharp) {
+    const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
+    attempt(pieces.search(poses_of(best)), calm);
+    attempt(pieces.search(starts.back()), calm);
+    attempt(short_pieces.search(poses_of(best)), calm);
+    attempt(poses_of(best), restless(4.));
+    attempt(short_pieces.search(poses_of(best)), restless(4.));
+    attempt(poses_of(best), restless(16.));
+    attempt(poses_of(best), restless(4.));
+  }
+  if (options.finest_mm < calm.finest_mm) {
+    best_options.finest_mm = options.finest_mm;
+    best = refine_poses(input, poses_of(best), best_options);
+  }
   return best;
 }
 

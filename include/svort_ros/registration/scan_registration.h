@@ -23,8 +23,13 @@ namespace svort {
 std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vector<Pose>& start, double size_mm,
                                   const RefinementOptions& options = {}, const TemplateOptions& match = {});
 
-/// refine_poses() of a whole scan, from every start and from assemble_stacks() of the last; the one with the lowest
-/// cost.
+/// refine_poses() of a whole scan, from every start and from assemble_stacks() of the last.
+///
+/// With several stacks the answer is the one whose pieces, runs of about 8 slices, correlate best with the volume of
+/// all others. If they do not correlate well, the head has jumped within a stack: pieces are then searched for, one
+/// after another, over turns of up to 80 degrees, and everything is refined from there, also with images that count 4
+/// and 16 times as much as RefinementOptions::image_trust. That takes several times as long. With one stack it is the
+/// answer of lowest cost.
 ///
 /// @param starts  at least one; each one pose per slice
 /// @throws std::invalid_argument naming what does not fit
