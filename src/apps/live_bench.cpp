@@ -26,19 +26,24 @@ namespace svort {
 
 const char* const kLiveBenchUsage =
     "       svort_bench live [--slices N,..] [--stacks N] [--threads N] [--full N] [--volumes yes|no] [--seed N]\n"
+    "                        [--weights FILE]\n"
     "Feeds a simulated scan to the live pipeline (registration) and times each slice: arrival to pose (ms; median, 95 "
     "%\n"
     "quantile and largest since the first slice), the mean of the last 15, arrival to volume and to the decisions "
     "(head\n"
     "motion, slice quality, coverage, reacquisition) that follow it. Ratios compare with registering all slices again\n"
     "per arrival from the last poses (full_over_this) and from the scanner's poses, as at the end of a scan\n"
-    "(rerun_over_this). Last line: how far the poses of both updates are from each other once the scan has ended.\n"
+    "(rerun_over_this). Last line: how far the poses of both updates are from each other, and from the truth, once "
+    "the\n"
+    "scan has ended.\n"
     "  --slices   kept slices at which a line is printed, default 15,45,90,450\n"
     "  --stacks   stacks per scan, 1 to 6, default 3; scans follow one another as stacks of one scan\n"
     "  --threads  default: all cores\n"
     "  --full     run the same with all slices registered again per arrival, up to so many slices; default 90\n"
     "  --volumes  also estimate the volume and decide after each slice, default yes\n"
-    "  --seed     of the simulated scan, default 1\n";
+    "  --seed     of the simulated scan, default 1\n"
+    "  --weights  of the live network: lines with its answers as candidates, too, and the slices that it encodes per "
+    "arrival\n";
 
 namespace {
 
@@ -51,6 +56,7 @@ struct Options {
   std::int64_t full = 90;
   bool volumes = true;
   std::uint64_t seed = 1;
+  std::string weights;
 };
 
 Options parse(const std::vector<std::string>& arguments) {
@@ -69,6 +75,8 @@ Options parse(const std::vector<std::string>& arguments) {
       options.full = positive_integers(name, value, 5000).front();
     else if (name == "--seed")
       options.seed = static_cast<std::uint64_t>(positive_integers(name, value, 1000000).front());
+    else if (name == "--weights")
+      options.weights = value;
     else if (name == "--volumes" && (value == "yes" || value == "no"))
       options.volumes = value == "yes";
     else
@@ -78,15 +86,21 @@ Options parse(const std::vector<std::string>& arguments) {
   return options;
 }
 
+/// A slice, and where it lies.
+struct KnownSlice {
+  Slice slice;
+  Pose T_brain_slice = Pose::Identity();
+};
+
 /// Scans of one head (the built-in phantom), one after another, as stacks of one scan.
 class Slices {
  public:
   explicit Slices(const Options& options) : simulator_(simulator(options)) {}
 
-  Slice next() {
+  KnownSlice next() {
     if (at_ == scan_.size()) {
-      const std::int64_t start_ns = scan_.empty() ? 1000000000 : scan_.back().info.stamp_ns + 10000000000;
-      const int first_stack = scan_.empty() ? 0 : scan_.back().info.stack + 1;
+      const std::int64_t start_ns = scan_.empty() ? 1000000000 : scan_.back().slice.info.stamp_ns + 10000000000;
+      const int first_stack = scan_.empty() ? 0 : scan_.back().slice.info.stack + 1;
       const SimulatedScan scan = simulator_.simulate(number_++, 1).front();
       ScanSlicesOptions how;
       how.scan_id = "benchmark";
@@ -95,7 +109,8 @@ class Slices {
       std::size_t i = 0;
       for (Slice& slice : scan_slices(scan, how)) {
         slice.info.stack += first_stack;
-        if (!scan.dropped[i++]) scan_.push_back(std::move(slice));
+        if (!scan.dropped[i]) scan_.push_back({std::move(slice), scan.plan.acquired[i].T_brain_slice()});
+        ++i;
       }
       at_ = 0;
     }
@@ -119,7 +134,7 @@ class Slices {
 
   ScanSimulator simulator_;
   std::uint64_t number_ = 0;
-  std::vector<Slice> scan_;
+  std::vector<KnownSlice> scan_;
   std::size_t at_ = 0;
 };
 
@@ -147,24 +162,30 @@ double rerun_ms(const LivePipeline& pipeline) {
   return milliseconds_since(start);
 }
 
+/// @param weights of the network whose answers are candidates; empty: none
 /// @param baseline of the other update; empty: none
-Baseline run(const Options& options, const std::string& update, const Baseline& baseline) {
+Baseline run(const Options& options, const std::string& update, const std::string& weights, const Baseline& baseline) {
   PipelineOptions pipeline_options;
   pipeline_options.estimator.update = update;
+  pipeline_options.estimator.network.candidate = !weights.empty();
+  pipeline_options.estimator.network.weights = weights;
   LivePipeline pipeline(pipeline_options);
   DecisionEngine decisions{DecisionOptions()};
   Slices slices(options);
-  std::vector<double> pose_ms, volume_ms, decision_ms;
+  std::vector<double> pose_ms, volume_ms, decision_ms, encoded;
+  std::size_t network_starts = 0;
   Baseline measured;
   const bool full = update == "full";
   const std::int64_t last = full ? std::min(options.full, options.slices.back()) : options.slices.back();
   for (const std::int64_t count : options.slices) {
     if (count > last) break;
     while (static_cast<std::int64_t>(pose_ms.size()) < count) {
-      const Slice slice = slices.next();
+      const Slice slice = slices.next().slice;
       const Clock::time_point arrived = Clock::now();
       if (!is_kept(pipeline.add(slice).status)) continue;
       pose_ms.push_back(milliseconds_since(arrived));
+      encoded.push_back(static_cast<double>(pipeline.estimate().encoded));
+      if (pipeline.newest()->start.rfind("network", 0) == 0) ++network_starts;
       if (!options.volumes) continue;
       pipeline.update_volume();
       volume_ms.push_back(milliseconds_since(arrived));
@@ -176,15 +197,18 @@ Baseline run(const Options& options, const std::string& update, const Baseline& 
     for (auto ms = recent; ms != pose_ms.end(); ++ms) mean += *ms / static_cast<double>(pose_ms.end() - recent);
     measured.last_15_ms.push_back(mean);
     const std::size_t at = measured.last_15_ms.size() - 1;
-    std::cout << R"({"benchmark": "live", "update": ")" << update << R"(", "slices": )" << count
-              << R"(, "stacks_per_scan": )" << options.stacks << R"(, "threads": )" << options.threads
-              << R"(, "pose_ms_median": )" << quantile(pose_ms, 0.5) << R"(, "pose_ms_p95": )"
-              << quantile(pose_ms, 0.95) << R"(, "pose_ms_max": )" << quantile(pose_ms, 1.)
-              << R"(, "pose_ms_last_15": )" << mean;
+    std::cout << R"({"benchmark": "live", "update": ")" << update << R"(", "network": )"
+              << (weights.empty() ? "false" : "true") << R"(, "slices": )" << count << R"(, "stacks_per_scan": )"
+              << options.stacks << R"(, "threads": )" << options.threads << R"(, "pose_ms_median": )"
+              << quantile(pose_ms, 0.5) << R"(, "pose_ms_p95": )" << quantile(pose_ms, 0.95) << R"(, "pose_ms_max": )"
+              << quantile(pose_ms, 1.) << R"(, "pose_ms_last_15": )" << mean;
     if (options.volumes)
       std::cout << R"(, "volume_ms_median": )" << quantile(volume_ms, 0.5) << R"(, "volume_ms_p95": )"
                 << quantile(volume_ms, 0.95) << R"(, "decision_ms_median": )" << quantile(decision_ms, 0.5)
                 << R"(, "decision_ms_p95": )" << quantile(decision_ms, 0.95);
+    if (!weights.empty())
+      std::cout << R"(, "encoded_median": )" << quantile(encoded, 0.5) << R"(, "encoded_max": )"
+                << quantile(encoded, 1.) << R"(, "network_starts": )" << network_starts;
     if (full) measured.rerun_ms.push_back(rerun_ms(pipeline));
     if (full) std::cout << R"(, "rerun_ms": )" << measured.rerun_ms.back();
     if (at < baseline.last_15_ms.size())
@@ -196,28 +220,41 @@ Baseline run(const Options& options, const std::string& update, const Baseline& 
   return measured;
 }
 
-torch::Tensor final_poses(const Options& options, const std::string& update, std::int64_t count) {
+/// Poses once the scan has ended, in acquisition order, and the truth.
+struct End {
+  torch::Tensor poses, truth;
+};
+
+End end_of_scan(const Options& options, const std::string& update, std::int64_t count) {
   PipelineOptions pipeline_options;
   pipeline_options.estimator.update = update;
   pipeline_options.estimator.final_volume.passes = 0;  // poses are what is compared
   LivePipeline pipeline(pipeline_options);
   Slices slices(options);
-  for (std::int64_t kept = 0; kept < count;)
-    if (is_kept(pipeline.add(slices.next()).status)) ++kept;
+  std::vector<Pose> poses, truth;
+  while (static_cast<std::int64_t>(truth.size()) < count) {
+    const KnownSlice next = slices.next();
+    if (is_kept(pipeline.add(next.slice).status)) truth.push_back(next.T_brain_slice);
+  }
   pipeline.finalise();
-  std::vector<Pose> poses;
   for (const SliceEstimate& slice : pipeline.estimate().slices) poses.push_back(slice.T_brain_slice);
-  return poses_tensor(poses);
+  return {poses_tensor(poses), poses_tensor(truth)};
 }
 
 /// Whether what was gained while the scan ran costs anything at its end.
 void compare_ends(const Options& options) {
   const std::int64_t count = std::min(options.full, options.slices.back());
-  const PoseErrors difference = relative_pose_errors(final_poses(options, "incremental", count),
-                                                     final_poses(options, "full", count), AnchorFrame());
-  std::cout << R"({"benchmark": "live", "slices": )" << count << R"(, "final_difference_mm": )"
-            << summarise(difference.ed).mean << R"(, "final_difference_deg": )"
-            << summarise(difference.gd).mean * 180. / M_PI << "}" << std::endl;
+  const End incremental = end_of_scan(options, "incremental", count), full = end_of_scan(options, "full", count);
+  const PoseErrors difference = relative_pose_errors(incremental.poses, full.poses, AnchorFrame());
+  const auto error_mm = [](const End& end) {
+    return summarise(relative_pose_errors(end.poses, end.truth, AnchorFrame()).ed).mean;
+  };
+  const ErrorSummary mm = summarise(difference.ed);
+  std::cout << R"({"benchmark": "live", "slices": )" << count << R"(, "final_difference_mm": )" << mm.mean
+            << R"(, "final_difference_mm_median": )" << mm.median << R"(, "final_difference_mm_max": )" << mm.maximum
+            << R"(, "final_difference_deg": )" << summarise(difference.gd).mean * 180. / M_PI
+            << R"(, "final_error_mm_incremental": )" << error_mm(incremental) << R"(, "final_error_mm_full": )"
+            << error_mm(full) << "}" << std::endl;
 }
 
 }  // namespace
@@ -225,8 +262,9 @@ void compare_ends(const Options& options) {
 void run_live_bench(const std::vector<std::string>& arguments) {
   const Options options = parse(arguments);
   set_thread_count(static_cast<int>(options.threads));
-  const Baseline full = run(options, "full", {});
-  run(options, "incremental", full);
+  const Baseline full = run(options, "full", "", {});
+  run(options, "incremental", "", full);
+  if (!options.weights.empty()) run(options, "incremental", options.weights, full);
   compare_ends(options);
 }
 

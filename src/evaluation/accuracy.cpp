@@ -3,9 +3,13 @@
 #include <torch/types.h>
 
 #include <algorithm>
+#include <cmath>
+#include <map>
 #include <stdexcept>
+#include <utility>
 
 #include "scored_poses.h"
+#include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/registration/canonical_frame.h"
@@ -37,6 +41,47 @@ Pose frame_motion(const std::vector<SliceEstimate>& before, const std::vector<Sl
                            : global_alignment(poses_tensor(old_poses), poses_tensor(new_poses), kEvaluationFrame);
 }
 
+/// Errors of causal poses over their radii; the other slices, where they were at that moment, hold the frame.
+class RadiusRatios {
+ public:
+  void add(const LivePipeline& pipeline, const Pose& truth) {
+    const SliceEstimate& newest = *pipeline.newest();
+    const std::vector<SliceEstimate>& slices = pipeline.estimate().slices;
+    truth_[key_of(newest.info)] = truth;
+    if (newest.status != PoseStatus::registered || !std::isfinite(newest.radius_95_mm)) return;
+    std::vector<Pose> here, there;
+    for (const SliceEstimate& slice : slices) {
+      if (key_of(slice.info) == key_of(newest.info)) continue;
+      here.push_back(slice.T_brain_slice);
+      there.push_back(truth_.at(key_of(slice.info)));
+    }
+    const double lever_mm = pipeline.options().estimator.registration.lever_mm;
+    const Pose off = fit_planes(here, there, lever_mm) * newest.T_brain_slice * truth.inverse();
+    const double error_mm = std::hypot(off.translation().norm(), lever_mm * rotation_angle(off));
+    const bool one_stack = std::all_of(slices.begin(), slices.end(), [&](const SliceEstimate& slice) {
+      return slice.info.stack == newest.info.stack;
+    });
+    (one_stack ? one_stack_ : more_).push_back(error_mm / newest.radius_95_mm);
+  }
+  RadiusScore one_stack() const { return score(one_stack_); }
+  RadiusScore more() const { return score(more_); }
+
+ private:
+  static std::pair<int, int> key_of(const SliceInfo& info) { return {info.stack, info.index}; }
+  static RadiusScore score(std::vector<double> ratios) {
+    RadiusScore result;
+    if (ratios.empty()) return result;
+    std::sort(ratios.begin(), ratios.end());
+    result.slices = ratios.size();
+    result.within = static_cast<std::size_t>(std::upper_bound(ratios.begin(), ratios.end(), 1.) - ratios.begin());
+    result.ratio_95 = ratios[static_cast<std::size_t>(0.95 * static_cast<double>(ratios.size() - 1) + 0.5)];
+    return result;
+  }
+
+  std::map<std::pair<int, int>, Pose> truth_;
+  std::vector<double> one_stack_, more_;
+};
+
 }  // namespace
 
 AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& method, const AccuracySetup& setup) {
@@ -52,7 +97,11 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   PipelineOptions options = setup.pipeline;
   const bool live = method.source == PoseSource::live;
   options.estimator.method = "nominal";
-  if (live) options.estimator.method = "registration";
+  if (live) {
+    options.estimator.method = "registration";
+    options.estimator.network.candidate = !method.weights.empty();
+    options.estimator.network.weights = method.weights;
+  }
   if (method.source == PoseSource::network) {
     options.estimator.method = "network";
     options.estimator.network.weights = method.weights;
@@ -60,6 +109,7 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   LivePipeline pipeline(options);
   std::vector<std::pair<const SliceInfo*, Pose>> truth_of;
   std::vector<double> latency_ms;
+  RadiusRatios radius_ratios;
   Answer answer;
   std::vector<Pose> published;
   std::vector<Pose> published_truth;
@@ -74,6 +124,8 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     const double ms = 1e3 * arrival.seconds();
     const std::size_t count = pipeline.estimate().slices.size();
     if (count >= 80) latency_ms.push_back(ms);
+    radius_ratios.add(pipeline, scan.truth[i]);
+    if (pipeline.newest()->start.rfind("network", 0) == 0) ++row.network_starts;
     // Where the brain frame was moved, and said so, what was published before moves with it.
     if (pipeline.estimate().frame_revision != frame_revision && !published.empty()) {
       const Pose T_new_old = frame_motion(before, pipeline.estimate().slices);
@@ -129,6 +181,8 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   if (live) {
     answer.T_brain_slice = published;
     answer.truth = published_truth;
+    row.radius_one_stack = radius_ratios.one_stack();
+    row.radius = radius_ratios.more();
     if (!latency_ms.empty()) {
       std::sort(latency_ms.begin(), latency_ms.end());
       row.p95_ms = latency_ms[static_cast<std::size_t>(0.95 * static_cast<double>(latency_ms.size() - 1) + 0.5)];

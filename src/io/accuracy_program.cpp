@@ -17,6 +17,7 @@
 #include "svort_ros/io/options_file.h"
 #include "svort_ros/io/plots.h"
 #include "svort_ros/live/threads.h"
+#include "svort_ros/network/checkpoint.h"
 
 namespace svort {
 namespace {
@@ -64,6 +65,8 @@ std::vector<Task> all_tasks(const Plan& plan) {
     const std::string name = network.substr(0, split), file = network.substr(split + 1);
     tasks.push_back({false, 3, {name, PoseSource::network, file, false, true}});
     tasks.push_back({false, 3, {name + " then registration", PoseSource::network, file, true, true}});
+    if (read_checkpoint(file).network == "live")
+      tasks.push_back({false, 3, {"live at arrival with " + name, PoseSource::live, file, false, false}});
   }
   return tasks;
 }
@@ -207,7 +210,10 @@ int run_svort_accuracy(int argc, char** argv) {
   app.add_option("--methods", plan.methods, "only these rows of the table");
   app.add_option("--real", plan.real, "instead of simulating: stacks of a real scan, NIfTI, in acquisition order");
   app.add_option("--real-masks", plan.real_masks, "their brain masks");
-  app.add_option("--network", plan.networks, "NAME=FILE of weights: a row of that network, and one with registration");
+  app.add_option(
+      "--network", plan.networks,
+      "NAME=FILE of weights: a row of that network, one with registration, and, for the live network, one of "
+      "live poses with its candidates");
   app.add_option("--output", plan.output, "folder for the results; made if needed")->required();
   app.add_option("--seed", plan.seed, "of all random numbers")->capture_default_str();
   app.add_option("--threads", plan.threads, "0: all cores")->capture_default_str();

@@ -47,6 +47,20 @@ class Group {
     if (values(value).empty()) return "-";
     return fixed(mean(value), decimals) + " / " + fixed(median(value), decimals);
   }
+  template <class Value>
+  std::size_t sum(const Value& value) const {
+    std::size_t result = 0;
+    for (const AccuracyRow* row : rows_) result += value(*row);
+    return result;
+  }
+  /// "percent within (of how many; ratio)"
+  std::string coverage(RadiusScore AccuracyRow::*radius) const {
+    const std::size_t slices = sum([&](const AccuracyRow& row) { return (row.*radius).slices; });
+    if (slices == 0) return "-";
+    const std::size_t within = sum([&](const AccuracyRow& row) { return (row.*radius).within; });
+    return fixed(100. * static_cast<double>(within) / static_cast<double>(slices), 1) + " (" + std::to_string(slices) +
+           "; " + fixed(median([&](const AccuracyRow& row) { return (row.*radius).ratio_95; }), 2) + ")";
+  }
   /// How many frames are turned by more than 45 degrees, and how many of those the match took for sure.
   std::string turned(FrameScore AccuracyRow::*frame) const {
     int known = 0, count = 0, sure = 0;
@@ -128,6 +142,20 @@ const std::vector<CsvColumn<AccuracyRow>>& accuracy_columns() {
         "seconds", [](AccuracyRow & r) -> auto& { return r.seconds; });
     add(
         "p95_ms", [](AccuracyRow & r) -> auto& { return r.p95_ms; });
+    add(
+        "radius_slices", [](AccuracyRow & r) -> auto& { return r.radius.slices; });
+    add(
+        "radius_within", [](AccuracyRow & r) -> auto& { return r.radius.within; });
+    add(
+        "radius_ratio_95", [](AccuracyRow & r) -> auto& { return r.radius.ratio_95; });
+    add(
+        "radius_slices_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.slices; });
+    add(
+        "radius_within_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.within; });
+    add(
+        "radius_ratio_95_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.ratio_95; });
+    add(
+        "network_starts", [](AccuracyRow & r) -> auto& { return r.network_starts; });
     return list;
   }();
   return all;
@@ -195,6 +223,22 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
          << fixed(p95.back(), 0) << " |\n";
   });
   if (live) text << "\nArrivals with 80 slices or more in the sequence.\n";
+  bool radii = false;
+  for_groups([&](const std::string& motion, const std::string& method, const Group& group) {
+    const std::string more = group.coverage(&AccuracyRow::radius), one = group.coverage(&AccuracyRow::radius_one_stack);
+    if (more == "-" && one == "-") return;
+    if (!radii)
+      text << "\n| motion | poses | within their 95 % radius | first stack | from the network "
+              "|\n|---|---|---|---|---|\n";
+    radii = true;
+    text << "| " << motion << " | " << method << " | " << more << " | " << one << " | "
+         << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " |\n";
+  });
+  if (radii)
+    text << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
+            "how "
+            "many; 0.95 quantile of error over radius, median over scans), from the second stack on and in the first. "
+            "From the network: slices that were registered from where the network had put them.\n";
   return text.str();
 }
 

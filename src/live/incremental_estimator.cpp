@@ -3,6 +3,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "svort_ros/live/network_candidates.h"
 #include "svort_ros/live/network_estimator.h"
 #include "svort_ros/live/nominal_estimator.h"
 #include "svort_ros/live/registration_estimator.h"
@@ -27,7 +28,11 @@ const char* to_string(PoseStatus status) {
 
 std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options,
                                                      std::vector<BrainTemplate> templates) {
-  if (options.method == "registration") return std::make_unique<RegistrationEstimator>(options, std::move(templates));
+  if (options.method == "registration") {
+    if (!options.network.candidate) return std::make_unique<RegistrationEstimator>(options, std::move(templates));
+    return std::make_unique<RegistrationEstimator>(options, std::move(templates),
+                                                   std::make_unique<NetworkCandidates>(options.network));
+  }
   if (options.method == "nominal") return std::make_unique<NominalEstimator>(options);
   if (options.method == "network") return std::make_unique<NetworkEstimator>(options);
   throw std::invalid_argument("estimator.method is '" + options.method + "'; known: registration, network, nominal");

@@ -5,36 +5,17 @@
 #include <stdexcept>
 #include <utility>
 
+#include "estimator_network.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/live/network_input.h"
 
 namespace svort {
 namespace {
 
-std::pair<NetworkInstance, Checkpoint> load(const NetworkEstimatorOptions& options) {
-  if (options.weights.empty())
-    throw std::invalid_argument(
-        "estimator.network.weights is empty; estimator.method 'network' needs a file of weights");
-  Checkpoint about;
-  NetworkInstance network = load_network(options.weights, &about);
-  if (!options.name.empty() && options.name != network.name)
-    throw std::invalid_argument("estimator.network.name is '" + options.name + "', but " + options.weights +
-                                " holds network '" + network.name + "'");
-  return {std::move(network), std::move(about)};
-}
-
 bool runs_at_every_arrival(const NetworkEstimatorOptions& options) {
   if (options.when == "every_arrival") return true;
   if (options.when == "scan_end") return false;
   throw std::invalid_argument("estimator.network.when is '" + options.when + "'; known: scan_end, every_arrival");
-}
-
-AcquisitionFormulation formulation_of(const NetworkEstimatorOptions& options) {
-  try {
-    return acquisition_formulation(options.formulation);
-  } catch (const std::invalid_argument& error) {
-    throw std::invalid_argument(std::string("estimator.network.formulation: ") + error.what());
-  }
 }
 
 RunnerOptions runner_options(const NetworkEstimatorOptions& options) { return {options.device, options.precision}; }
@@ -53,7 +34,7 @@ NetworkGrid network_grid(const EstimatorOptions& options) {
 }  // namespace
 
 NetworkEstimator::NetworkEstimator(const EstimatorOptions& options)
-    : NetworkEstimator(options, load(options.network)) {}
+    : NetworkEstimator(options, load_estimator_network(options.network, "estimator.method 'network'")) {}
 
 NetworkEstimator::NetworkEstimator(const EstimatorOptions& options, std::pair<NetworkInstance, Checkpoint> loaded)
     : NetworkEstimator(options, std::move(loaded.first), loaded.second) {}
@@ -61,16 +42,11 @@ NetworkEstimator::NetworkEstimator(const EstimatorOptions& options, std::pair<Ne
 NetworkEstimator::NetworkEstimator(const EstimatorOptions& options, NetworkInstance network, const Checkpoint& about)
     : NominalEstimator(options),
       every_arrival_(runs_at_every_arrival(options.network)),
-      iterations_(options.network.iterations),
+      iterations_(network_iterations(options.network)),
       grid_(network_grid(options)),
-      formulation_(formulation_of(options.network)),
-      runner_(std::move(network), runner_options(options.network)),
-      weights_sha256_(about.sha256),
-      untrained_(is_untrained(about.provenance)) {
-  if (iterations_ < 0 || iterations_ > 100)
-    throw std::invalid_argument("estimator.network.iterations is " + std::to_string(iterations_) +
-                                "; it must be 0 to 100");
-}
+      formulation_(network_formulation(options.network)),
+      notes_(network_notes(network, about)),
+      runner_(std::move(network), runner_options(options.network)) {}
 
 void NetworkEstimator::add(const SliceSequence& sequence) {
   if (!every_arrival_) {
@@ -102,13 +78,7 @@ void NetworkEstimator::reset() {
 }
 
 EstimatorNotes NetworkEstimator::notes() const {
-  EstimatorNotes notes;
-  notes.network = runner_.network().name;
-  notes.weights_sha256 = weights_sha256_;
-  if (untrained_) {
-    notes.warnings.push_back("the weights of network " + notes.network +
-                             " are UNTRAINED: its poses mean nothing, they only show that the programs run");
-  }
+  EstimatorNotes notes = notes_;
   if (!runner_.diagnostic().empty()) notes.warnings.push_back(runner_.diagnostic());
   return notes;
 }

@@ -29,7 +29,8 @@ Eigen::Vector3d crop_centre(const PreparedSlice& slice) {
   return (slice.info.T_scanner_slice * slice.T_slice_crop).translation();
 }
 
-std::map<int, StackFrame> stack_frames(const SliceSequence& sequence) {
+/// @param intensities whether the stacks' own scales are needed
+std::map<int, StackFrame> stack_frames(const SliceSequence& sequence, bool intensities) {
   std::map<int, StackFrame> frames;
   for (const auto& slice : sequence.slices()) {
     const auto [entry, is_new] = frames.try_emplace(slice->info.stack);
@@ -47,6 +48,7 @@ std::map<int, StackFrame> stack_frames(const SliceSequence& sequence) {
     }
     ++frame.count;
     frame.origin.z() += (centre.z() - frame.origin.z()) / static_cast<double>(frame.count);
+    if (!intensities) continue;
     std::copy_if(slice->pixels.begin(), slice->pixels.end(), std::back_inserter(frame.positive),
                  [](float value) { return value > 0.F; });
   }
@@ -71,9 +73,8 @@ void copy_shifted(const PreparedSlice& slice, int shift_x, int shift_y, float sc
   }
 }
 
-}  // namespace
-
-SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
+/// @param images whether to fill in `slices`
+SequenceInput prepare(const SliceSequence& sequence, bool common_frame, bool images) {
   const auto& slices = sequence.slices();
   if (slices.empty()) throw std::invalid_argument("network_input: the sequence is empty");
   const auto n = static_cast<std::int64_t>(slices.size());
@@ -82,7 +83,7 @@ SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
 
   SequenceInput result;
   NetworkInput& input = result.input;
-  input.slices = torch::empty({n, 1, size, size});
+  if (images) input.slices = torch::empty({n, 1, size, size});
   input.transforms = torch::empty({n, 3, 4});
   input.positions = torch::empty({n, 2});
   input.slice_counts = torch::empty({n}, torch::kInt64);
@@ -91,7 +92,7 @@ SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
   input.slice_resolution_mm = resolution;
   input.thickness_mm = 0.;
 
-  const std::map<int, StackFrame> frames = stack_frames(sequence);
+  const std::map<int, StackFrame> frames = stack_frames(sequence, !common_frame);
   Pose T_scanner_centre = Pose::Identity();
   T_scanner_centre.translation() =
       sequence.brain_roi().empty() ? crop_centre(*slices.front()) : sequence.brain_roi().centre();
@@ -115,7 +116,7 @@ SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
       index = slice.info.index - frame.first - (frame.last - frame.first + 1) / 2;
       scale = frame.scale;
     }
-    copy_shifted(slice, shift_x, shift_y, scale, input.slices[i].data_ptr<float>());
+    if (images) copy_shifted(slice, shift_x, shift_y, scale, input.slices[i].data_ptr<float>());
     input.transforms[i].copy_(tensor_from_pose(T_frame_window).squeeze(0));
     input.positions[i][0] = static_cast<float>(index);
     input.positions[i][1] = static_cast<float>(frame.number);
@@ -128,5 +129,13 @@ SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
   }
   return result;
 }
+
+}  // namespace
+
+SequenceInput network_input(const SliceSequence& sequence, bool common_frame) {
+  return prepare(sequence, common_frame, true);
+}
+
+NetworkInput network_geometry(const SliceSequence& sequence) { return prepare(sequence, true, false).input; }
 
 }  // namespace svort

@@ -2,13 +2,13 @@
 
 #include <torch/types.h>
 
-#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <stdexcept>
 #include <utility>
 
+#include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
 #include "svort_ros/registration/canonical_frame.h"
@@ -20,24 +20,9 @@ namespace {
 constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to register to
 constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
 constexpr std::size_t kSlicesBetweenMatches = 15;
+constexpr double kFollowedGain = 0.01;  // of the cost: less is a matter of where the last pass stopped
 constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
-
-/// The rigid motion that brings the planes `from` closest to `to`, by the corners of their fields.
-Pose best_fit(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm) {
-  const auto n = static_cast<Eigen::Index>(from.size());
-  Eigen::Matrix3Xd a(3, 3 * n), b(3, 3 * n);
-  for (Eigen::Index i = 0; i < n; ++i) {
-    const auto k = static_cast<std::size_t>(i);
-    const Eigen::Vector3d corner[] = {
-        {-half_field_mm, -half_field_mm, 0.}, {0., 0., 0.}, {half_field_mm, -half_field_mm, 0.}};
-    for (Eigen::Index j = 0; j < 3; ++j) {
-      a.col(3 * i + j) = from[k] * corner[j];
-      b.col(3 * i + j) = to[k] * corner[j];
-    }
-  }
-  return Pose(Eigen::umeyama(a, b, false));
-}
 
 double half_field_mm(const SliceSequence& sequence) {
   return 0.5 * sequence.options().size_px * sequence.options().resolution_mm;
@@ -45,14 +30,18 @@ double half_field_mm(const SliceSequence& sequence) {
 
 }  // namespace
 
-RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates)
-    : options_(options), templates_(std::move(templates)) {
+RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates,
+                                             std::unique_ptr<CandidateSource> source)
+    : options_(options), templates_(std::move(templates)), source_(std::move(source)) {
   svort::validate(options);
   validate(options.registration);
   validate(options.template_match);
   validate(options.incremental);
   if (options.update != "incremental" && options.update != "full")
     throw std::invalid_argument("estimator.update is '" + options.update + "'; known: incremental, full");
+  if (source_ && options.update != "incremental")
+    throw std::invalid_argument("estimator.update is '" + options.update +
+                                "', which knows no candidates; estimator.network.candidate needs incremental");
   if (options.budget != "iterations" && options.budget != "time")
     throw std::invalid_argument("estimator.budget is '" + options.budget + "'; known: iterations, time");
   formulation_ = acquisition_formulation(options.formulation);
@@ -148,6 +137,11 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   for (const auto& [name, where] : {std::pair{"stack begin", began}, std::pair{"scan begin", slices.begin()}})
     if (where != slices.begin() + static_cast<std::ptrdiff_t>(position))
       candidates.push_back({name, start(where->T_scanner_brain)});
+  if (source_) {
+    for (PoseCandidate& candidate : source_->propose(sequence, position, *incremental_))
+      candidates.push_back(std::move(candidate));
+    estimate_.encoded = source_->take_encoded();
+  }
   slices[position].start = incremental_->choose(position, candidates).name;
   incremental_->refine_around(position);
   for (int i = 0; i < options_.incremental.sweeps; ++i) incremental_->sweep();
@@ -165,7 +159,7 @@ void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std:
     before.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
     after.push_back(incremental_->slices()[i].T_brain_slice);
   }
-  const Pose held = before.empty() ? Pose::Identity() : best_fit(after, before, half_field_mm(sequence));
+  const Pose held = before.empty() ? Pose::Identity() : fit_planes(after, before, half_field_mm(sequence));
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
     SliceEstimate& slice = estimate_.slices[i];
     const RefinedSlice& refined = incremental_->slices()[i];
@@ -216,7 +210,7 @@ void RegistrationEstimator::take(const SliceSequence& sequence, const Refinement
   // Registration sees relative motion only: the slices that were here hold the frame where it was.
   std::vector<Pose> after;
   for (const RefinedSlice& each : refinement.slices) after.push_back(each.T_brain_slice);
-  const Pose held = best_fit(after, before, half_field_mm(sequence));
+  const Pose held = fit_planes(after, before, half_field_mm(sequence));
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
     SliceEstimate& slice = estimate_.slices[i];
     const RefinedSlice& refined = refinement.slices[i];
@@ -238,6 +232,7 @@ void RegistrationEstimator::move_frame(const Pose& T_new_old) {
   std::vector<RefinedSlice> slices = incremental_->slices();
   for (RefinedSlice& slice : slices) slice.T_brain_slice = T_new_old * slice.T_brain_slice;
   incremental_->set(slices);
+  if (source_) source_->move_frame(T_new_old);
 }
 
 void RegistrationEstimator::align_to_template(const SliceSequence& sequence, const RegistrationInput& input) {
@@ -262,14 +257,13 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
   if (estimate_.slices.size() >= kFewestSlices) {
     const RegistrationInput input = registration_input(sequence);
     const std::vector<Pose> current = crop_poses(sequence);
-    // From the scanner's poses as well: what was learnt on the way may have led astray.
-    const Pose T_brain_world = best_fit(input.T_world_slice, current, half_field_mm(sequence));
-    std::vector<Pose> nominal;
-    for (const Pose& pose : input.T_world_slice) nominal.push_back(T_brain_world * pose);
-    take(sequence,
-         register_scan(input, {current, nominal}, options_.volume_size_mm, options_.registration,
-                       options_.template_match),
-         current);
+    // From the scanner's poses, so that the end does not depend on the way; from where the way has led only if that
+    // fits clearly better. `take` brings it into the frame that is there.
+    Refinement end = register_scan(input, {input.T_world_slice}, options_.volume_size_mm, options_.registration,
+                                   options_.template_match);
+    Refinement followed = refine_poses(input, current, options_.registration);
+    if (followed.report.last_cost < (1. - kFollowedGain) * end.report.last_cost) end = std::move(followed);
+    take(sequence, end, current);
     if (incremental_) {
       tell_incremental(sequence);
       incremental_->measure_uncertainty();
@@ -288,6 +282,7 @@ void RegistrationEstimator::reset() {
   estimate_.revision = revision;
   volume_ = Volume();
   incremental_.reset();
+  if (source_) source_->reset();
   idle_left_ = 0;
   aligned_ = false;
   aligned_count_ = 0;

@@ -207,6 +207,12 @@ torch::Tensor LiveNetwork::with_coordinates(const torch::Tensor& images) const {
 
 namespace {
 
+void require_features(const torch::Tensor& features, std::int64_t dim, const NetworkInput& input) {
+  require(features.defined() && features.dim() == 2 && features.size(1) == dim &&
+              features.size(0) == input.transforms.size(0),
+          "features must be n x " + std::to_string(dim) + ", one row per slice");
+}
+
 // Mean intensity of the brain to 1, slice by slice, for the slice and whatever belongs to it; n x c x p x p.
 torch::Tensor normalised(const torch::Tensor& images) {
   const torch::Tensor slice = images.slice(1, 0, 1);
@@ -268,19 +274,26 @@ LiveOutput LiveNetwork::speak(LiveTransformer& transformer, nn::Linear& head, co
 
 LiveOutput LiveNetwork::attend(const torch::Tensor& features, const NetworkInput& input,
                                const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
-  require(features.defined() && features.dim() == 2 && features.size(1) == options_.dim &&
-              features.size(0) == input.transforms.size(0),
-          "features must be n x " + std::to_string(options_.dim) + ", one row per slice");
+  require_features(features, options_.dim, input);
   const torch::Tensor tokens = options_.positional_embedding ? features + embed(input, true) : features;
   return speak(first_transformer_, first_head_, tokens, lengths, true, attention);
 }
 
+torch::Tensor LiveNetwork::encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated) {
+  return shared_encoder_->forward(with_coordinates(normalised(torch::cat({reduced, simulated}, 1))), precision_);
+}
+
+LiveOutput LiveNetwork::attend_placed(const torch::Tensor& features, const NetworkInput& input,
+                                      const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
+  require_features(features, options_.dim, input);
+  const torch::Tensor tokens = options_.positional_embedding ? features + embed(input, false) : features;
+  return speak(shared_transformer_, shared_head_, tokens, lengths, false, attention);
+}
+
 LiveOutput LiveNetwork::update(const torch::Tensor& simulated, const NetworkInput& input,
                                const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
-  torch::Tensor images = torch::cat({reduce(input.slices, input.slice_resolution_mm), simulated}, 1);
-  torch::Tensor tokens = shared_encoder_->forward(with_coordinates(normalised(images)), precision_);
-  if (options_.positional_embedding) tokens = tokens + embed(input, false);
-  return speak(shared_transformer_, shared_head_, tokens, lengths, false, attention);
+  return attend_placed(encode_placed(reduce(input.slices, input.slice_resolution_mm), simulated), input, lengths,
+                       attention);
 }
 
 std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const NetworkGrid& grid, const NetworkRun& run) {
@@ -354,29 +367,46 @@ PoseVotes live_votes(const LiveOutput& output, const NetworkInput& input, const 
   return votes;
 }
 
-torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const torch::Tensor& transforms,
-                                     const LiveNetworkOptions& options, double thickness_mm,
-                                     AcquisitionFormulation formulation) {
+namespace {
+
+/// The volume, made of the slices if there is none, seen from the slices' places.
+torch::Tensor look(const torch::Tensor& reduced, const AcquisitionGeometry& geometry, const torch::Tensor& given,
+                   std::int64_t size, double voxel_mm, AcquisitionFormulation formulation) {
   const torch::NoGradGuard no_grad;
-  const double voxel = options.input_resolution_mm;
-  const std::int64_t size = options.input_px;
   const torch::Tensor slices = reduced.cpu().contiguous();
   AcquisitionMasks masks;
   masks.slices = slices > 0;
-  AcquisitionGeometry geometry;
-  geometry.psf = gaussian_psf({1., 1., thickness_mm / voxel});
-  const torch::Tensor places = change_resolution(transforms.detach().cpu(), 1., voxel);
   const auto acquisition_at = [&](double shift_mm) {
     // trans_first: the translation is along the slice's own axes
-    geometry.transforms = places.clone();
-    geometry.transforms.select(1, 2).select(1, 3) += shift_mm / voxel;
-    return SliceAcquisition(geometry, options.input_px, options.input_px, {size, size, size}, formulation, masks);
+    AcquisitionGeometry shifted = geometry;
+    shifted.transforms = geometry.transforms.clone();
+    shifted.transforms.select(1, 2).select(1, 3) += shift_mm / voxel_mm;
+    return SliceAcquisition(shifted, static_cast<int>(slices.size(2)), static_cast<int>(slices.size(3)),
+                            {size, size, size}, formulation, masks);
   };
   const SliceAcquisition here = acquisition_at(0.);
-  const torch::Tensor volume = reconstruct_psf(slices, here);
+  const torch::Tensor volume = given.defined() ? given : reconstruct_psf(slices, here);
   const torch::Tensor slope =
       acquisition_at(kLiveNormalStepMm).forward(volume) - acquisition_at(-kLiveNormalStepMm).forward(volume);
   return torch::cat({here.forward(volume), slope}, 1).to(reduced.device());
+}
+
+}  // namespace
+
+torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const torch::Tensor& transforms,
+                                     const LiveNetworkOptions& options, double thickness_mm,
+                                     AcquisitionFormulation formulation) {
+  const double voxel = options.input_resolution_mm;
+  AcquisitionGeometry geometry;
+  geometry.psf = gaussian_psf({1., 1., thickness_mm / voxel});
+  geometry.transforms = change_resolution(transforms.detach().cpu(), 1., voxel);
+  return look(reduced, geometry, {}, options.input_px, voxel, formulation);
+}
+
+torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const AcquisitionGeometry& geometry,
+                                     const torch::Tensor& volume, double voxel_mm, AcquisitionFormulation formulation) {
+  require(volume.defined() && volume.dim() == 3, "the volume must be d x d x d");
+  return look(reduced, geometry, volume, volume.size(0), voxel_mm, formulation);
 }
 
 torch::Tensor apply_live_update(const torch::Tensor& transforms, const torch::Tensor& points,

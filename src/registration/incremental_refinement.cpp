@@ -2,7 +2,6 @@
 
 #include <torch/types.h>
 
-#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <iterator>
@@ -17,6 +16,7 @@
 #include "slice_weight.h"
 #include "svort_ros/acquisition/geometry_of_poses.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
+#include "svort_ros/geometry/rigid_fit.h"
 #include "trajectory.h"
 
 namespace svort {
@@ -83,7 +83,7 @@ class IncrementalRefinement::Engine {
     const PoseCandidate* best = &candidates.front();
     slices_.at(position).T_brain_slice = best->T_brain_slice;
     from_afar_ = false;
-    if (in_volume_ < kFewest || one_stack()) return *best;
+    if (!compares()) return *best;
     double best_ncc = -std::numeric_limits<double>::infinity();
     RefinedSlice best_state = slices_[position];
     // Where the head was is where it most likely is: a walk away from there has to be worth it.
@@ -178,6 +178,14 @@ class IncrementalRefinement::Engine {
     rebuild();
   }
 
+  bool compares() const { return in_volume_ >= kFewest && !one_stack(); }
+
+  torch::Tensor volume() {
+    update_sums();
+    return in_volume_ > 0 ? reconstructed() : torch::Tensor();
+  }
+  double voxel_mm() const { return pixel_mm_; }
+
   const std::vector<RefinedSlice>& slices() const { return slices_; }
   std::size_t take_replaced() { return std::exchange(replaced_, 0); }
 
@@ -231,7 +239,16 @@ class IncrementalRefinement::Engine {
     }
   }
 
-  void forget_volumes() { std::fill(std::begin(prepared_), std::end(prepared_), false); }
+  void forget_volumes() {
+    std::fill(std::begin(prepared_), std::end(prepared_), false);
+    volume_ = torch::Tensor();
+  }
+
+  const torch::Tensor& reconstructed() {
+    if (!volume_.defined())
+      volume_ = acquisition_of(kept_.front(), slices_.front().T_brain_slice).equalized_volume(sums_);
+    return volume_;
+  }
 
   void rebuild() {
     if (!sums_.defined()) return;
@@ -253,8 +270,6 @@ class IncrementalRefinement::Engine {
     const double psf = kInPlaneFwhm / kFwhmPerSigma;
     const std::int64_t voxels = size_ * size_ * size_;
     if (std::none_of(std::begin(prepared_), std::end(prepared_), [](bool is) { return is; })) {
-      const RefinedSlice& any = slices_.front();
-      const torch::Tensor volume = acquisition_of(kept_.front(), any.T_brain_slice).equalized_volume(sums_);
       std::vector<float> total(static_cast<std::size_t>(voxels));
       const double* sum = sums_.data_ptr<double>();
       for (std::int64_t i = 0; i < voxels; ++i) total[static_cast<std::size_t>(i)] = static_cast<float>(sum[2 * i + 1]);
@@ -262,7 +277,7 @@ class IncrementalRefinement::Engine {
       const float least = 1e-3F * std::max(1e-12F, *std::max_element(total.begin(), total.end()));
       seen_.assign(total.size(), 0.F);
       mean_.assign(total.size(), 0.F);
-      const float* value = volume.data_ptr<float>();
+      const float* value = reconstructed().data_ptr<float>();
       for (std::size_t i = 0; i < total.size(); ++i) {
         if (total[i] <= least) continue;
         seen_[i] = 1.F;
@@ -499,16 +514,9 @@ class IncrementalRefinement::Engine {
 
   /// While all slices move, nothing holds the frame but where they were.
   void hold_frame(const std::vector<Pose>& before) {
-    const auto n = static_cast<Eigen::Index>(before.size());
-    Eigen::Matrix3Xd a(3, 3 * n), b(3, 3 * n);
-    const double far = refinement_.lever_mm;
-    const Eigen::Vector3d corner[] = {{-far, -far, 0.}, {0., 0., 0.}, {far, -far, 0.}};
-    for (Eigen::Index i = 0; i < n; ++i)
-      for (Eigen::Index j = 0; j < 3; ++j) {
-        a.col(3 * i + j) = slices_[static_cast<std::size_t>(i)].T_brain_slice * corner[j];
-        b.col(3 * i + j) = before[static_cast<std::size_t>(i)] * corner[j];
-      }
-    const Pose held(Eigen::umeyama(a, b, false));
+    std::vector<Pose> now;
+    for (const RefinedSlice& slice : slices_) now.push_back(slice.T_brain_slice);
+    const Pose held = fit_planes(now, before, refinement_.lever_mm);
     for (RefinedSlice& slice : slices_) slice.T_brain_slice = held * slice.T_brain_slice;
   }
 
@@ -521,7 +529,7 @@ class IncrementalRefinement::Engine {
   std::vector<SliceTerms> terms_;
   double cost_ = 0.;  ///< mean robust cost per pixel at the last evaluate()
   std::int64_t size_ = 0;
-  torch::Tensor sums_;
+  torch::Tensor sums_, volume_;  ///< of the volume, and the volume itself unless the sums have changed since
   std::size_t in_volume_ = 0, replaced_ = 0, sweep_end_ = 0;
   std::vector<float> mean_, seen_;  ///< the volume, and 1 where a slice has seen it
   SampledVolume support_;           ///< sum of the weights that each voxel received
@@ -580,6 +588,13 @@ void IncrementalRefinement::measure_uncertainty() {
   engine_->measure_uncertainty();
 }
 
+torch::Tensor IncrementalRefinement::volume() {
+  const torch::NoGradGuard no_grad;
+  return engine_->volume();
+}
+
+bool IncrementalRefinement::compares() const { return engine_->compares(); }
+double IncrementalRefinement::voxel_mm() const { return engine_->voxel_mm(); }
 std::size_t IncrementalRefinement::windows() const { return engine_->windows(); }
 void IncrementalRefinement::set(const std::vector<RefinedSlice>& slices) { engine_->set(slices); }
 std::size_t IncrementalRefinement::count() const { return engine_->slices().size(); }

@@ -237,7 +237,7 @@ int run_svort_replay(int argc, char** argv) {
   app.add_option("--threads", options.server.node.threads, "threads of the estimator; 0 takes all cores")
       ->capture_default_str();
   svort::NetworkEstimatorOptions& network = options.server.pipeline.estimator.network;
-  CLI::Option* weights = app.add_option("--weights", network.weights, "run the network of this file (method network)");
+  CLI::Option* weights = app.add_option("--weights", network.weights, "run the network of this file (method network; with --estimator.network.candidate true: registration)");
   CLI::Option* name =
       app.add_option("--network", network.name, "run this network (method network): v1, v2, ..; the file must hold it");
   app.add_option("--device", network.device, "where the network runs: auto, cpu or cuda; all else is on the CPU")
@@ -259,7 +259,8 @@ int run_svort_replay(int argc, char** argv) {
       throw std::invalid_argument("give either --bag or --stacks");
     if (!options.bag.empty() && !options.input.masks.empty())
       throw std::invalid_argument("--masks goes with --stacks; a bag holds its masks itself");
-    if (weights->count() + name->count() > 0) options.server.pipeline.estimator.method = "network";
+    if (weights->count() + name->count() > 0 && !network.candidate)
+      options.server.pipeline.estimator.method = "network";
     const svort::EstimatorOptions& estimator = options.server.pipeline.estimator;
     if (estimator.method != "network" && estimator.network.device == "cuda")
       throw std::invalid_argument("--device cuda: estimator '" + estimator.method + "' runs on the CPU only");

@@ -87,6 +87,27 @@ TEST(Accuracy, VolumesAreComparedWithTheTruth) {
   EXPECT_LT(row.final.ssim, 1.);
 }
 
+TEST(Accuracy, CausalPosesAreCountedAgainstTheirRadii) {
+  EvaluationScanOptions options;
+  options.motion = "mild";
+  options.stacks = 2;
+  const EvaluationScan scan = simulate_evaluation_scan(small_brain(), options);
+  AccuracySetup setup = quick_setup();
+  const auto measured = [&](double factor) {
+    setup.pipeline.estimator.radius_factor = setup.pipeline.estimator.radius_factor_one_stack = factor;
+    return measure_accuracy(scan, method(PoseSource::live), setup);
+  };
+  const AccuracyRow wide = measured(1e3), narrow = measured(1e-3);
+  for (const RadiusScore AccuracyRow::*score : {&AccuracyRow::radius, &AccuracyRow::radius_one_stack}) {
+    EXPECT_GT((wide.*score).slices, 10U);
+    EXPECT_EQ((wide.*score).within, (wide.*score).slices);
+    EXPECT_EQ((narrow.*score).slices, (wide.*score).slices);
+    EXPECT_EQ((narrow.*score).within, 0U);
+    EXPECT_NEAR((narrow.*score).ratio_95, 1e6 * (wide.*score).ratio_95, 1.) << "errors do not depend on the factor";
+  }
+  EXPECT_EQ(wide.network_starts, 0U) << "there is no network";
+}
+
 TEST(StackCorrelations, RightPosesPredictTheStackThatIsLeftOut) {
   EvaluationScanOptions options;
   options.motion = "moderate";

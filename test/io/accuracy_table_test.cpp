@@ -56,6 +56,19 @@ TEST_F(AccuracyTable, ReadsBackWhatItWrote) {
   EXPECT_TRUE(std::isnan(rows[1].shipped.ed_mm));
 }
 
+TEST_F(AccuracyTable, PoolsTheSlicesWithinTheirRadii) {
+  AccuracyRow first = row("live", 1, 1.), second = row("live", 2, 1.);
+  first.radius = {60, 59, 0.8};
+  second.radius = {40, 30, 1.6};
+  first.radius_one_stack = {20, 19, 0.9};
+  second.network_starts = 3;
+  const auto path = folder_ / "accuracy.csv";
+  write_accuracy_rows(path, {first, second});
+  const std::string table = accuracy_markdown(read_accuracy_rows(path));
+  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 3 |"), std::string::npos) << table;
+  EXPECT_EQ(accuracy_markdown({row("nominal", 1, 1.)}).find("radius"), std::string::npos) << "no radii, no table";
+}
+
 TEST_F(AccuracyTable, NamesTheLineThatIsWrong) {
   const auto path = folder_ / "accuracy.csv";
   const auto message = [&]() -> std::string {

@@ -2,70 +2,20 @@
 
 #include <gtest/gtest.h>
 
-#include <cmath>
-#include <map>
 #include <stdexcept>
 #include <string>
 
+#include "moving_scan.h"
 #include "registration/registration_fixture.h"
 #include "svort_ros/live/live_pipeline.h"
 
 namespace svort {
 namespace {
 
+using svort_test::moving_scan;
+using svort_test::quick_options;
 using svort_test::relative_error_mm;
-
-PipelineOptions quick_options() {
-  PipelineOptions options;
-  options.sequence.size_px = 48;
-  options.sequence.resolution_mm = 2.;
-  options.estimator.method = "registration";
-  options.estimator.volume_resolution_mm = 2.;
-  options.estimator.volume_size_mm = 96.;
-  options.estimator.registration.finest_mm = 2.;
-  options.estimator.final_volume.resolution_mm = 2.;
-  return options;
-}
-
-/// The phantom's scan as a scanner would send it, in a scanner whose axes are not the head's.
-struct Scan {
-  std::vector<Slice> slices;
-  std::vector<Pose> truth;  ///< T_head_slice
-};
-
-Scan moving_scan(int stacks = 3) {
-  svort_test::SimulatedScanOptions options;
-  options.stacks = stacks;
-  options.between_mm = 6.;
-  const svort_test::SimulatedScan simulated = svort_test::simulated_scan(options);
-  Pose T_scanner_world = Pose::Identity();
-  T_scanner_world.linear() = Eigen::AngleAxisd(1.1, Eigen::Vector3d(1., 2., -1.).normalized()).toRotationMatrix();
-  T_scanner_world.translation() = Eigen::Vector3d(20., -35., 60.);
-  Scan scan;
-  scan.truth = simulated.truth;
-  std::map<int, int> next;
-  for (std::size_t i = 0; i < simulated.truth.size(); ++i) {
-    Slice slice;
-    slice.info.scan_id = "moving";
-    slice.info.stack = simulated.input.stack[i];
-    const int order = next[slice.info.stack]++;
-    slice.info.index = interleaved_order(options.slices, 2)[static_cast<std::size_t>(order)];
-    slice.info.slices_in_stack = options.slices;
-    slice.info.stamp_ns = std::llround((100. + simulated.input.time_s[i]) * 1e9);
-    slice.info.T_scanner_slice = T_scanner_world * simulated.input.T_world_slice[i];
-    slice.info.pixel_spacing = {2., 2.};
-    slice.info.thickness = 3.;
-    slice.info.columns = slice.info.rows = 64;
-    const auto row = static_cast<std::int64_t>(i);
-    const float* pixels = simulated.input.slices[row].data_ptr<float>();
-    slice.pixels.assign(pixels, pixels + 64 * 64);
-    for (float& value : slice.pixels) value *= 800.F;
-    const bool* mask = simulated.input.masks[row].data_ptr<bool>();
-    for (int k = 0; k < 64 * 64; ++k) slice.mask.push_back(mask[k] ? 1 : 0);
-    scan.slices.push_back(std::move(slice));
-  }
-  return scan;
-}
+using Scan = svort_test::MovingScan;
 
 BrainTemplate phantom_template() {
   const torch::Tensor values = svort_test::brain_volume(48, 2.);

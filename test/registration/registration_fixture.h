@@ -4,6 +4,7 @@
 
 #include <Eigen/Geometry>
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <random>
 #include <vector>
@@ -54,6 +55,8 @@ struct SimulatedScanOptions {
   double between_mm = 2.;  ///< and from stack to stack
   double noise = 0.01;
   unsigned seed = 1;
+  std::size_t jump_at = 0;  ///< number of the slice before which the head jumps
+  svort::Pose jump = svort::Pose::Identity();
 };
 
 struct SimulatedScan {
@@ -88,6 +91,7 @@ inline SimulatedScan simulated_scan(const SimulatedScanOptions& options) {
     if (stack > 0) T_head_scanner = small_motion(random, options.between_mm) * T_head_scanner;
     for (const int index : svort::interleaved_order(options.slices, 2)) {
       T_head_scanner = small_motion(random, options.walk_mm) * T_head_scanner;
+      if (scan.truth.size() == options.jump_at) T_head_scanner = options.jump * T_head_scanner;
       svort::Pose nominal = svort::Pose::Identity();
       nominal.linear() = axes;
       nominal.translation() = axes.col(2) * (3. * (index - .5 * (options.slices - 1)));

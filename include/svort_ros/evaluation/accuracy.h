@@ -25,7 +25,7 @@ enum class PoseSource {
 struct PoseMethod {
   std::string name;
   PoseSource source = PoseSource::registration;
-  std::string weights;       ///< file, for a network
+  std::string weights;       ///< file, for a network; live: its answers are candidates (NetworkEstimatorOptions)
   bool refined = false;      ///< registration afterwards, started from these poses ("SVR")
   bool with_volume = false;  ///< reconstruct volumes from these poses and compare them with the truth
 };
@@ -44,6 +44,12 @@ struct VolumeScore {
   double psnr_db = std::numeric_limits<double>::quiet_NaN(), ssim = std::numeric_limits<double>::quiet_NaN();
 };
 
+/// How often poses are within the radius that was published with them.
+struct RadiusScore {
+  std::size_t slices = 0, within = 0;  ///< registered, with a radius; those whose error is smaller
+  double ratio_95 = std::numeric_limits<double>::quiet_NaN();  ///< 0.95 quantile of error over radius: 1 is right
+};
+
 /// One scan, one method.
 struct AccuracyRow {
   std::string brain, motion, masks;  ///< masks: "usual" or "damaged"
@@ -59,6 +65,10 @@ struct AccuracyRow {
   double seconds = 0.;        ///< for the poses, without the frame and volumes
   double p95_ms = std::numeric_limits<double>::quiet_NaN();  ///< live: arrival to pose, from 80 slices on
   bool converged = true;
+  /// Live: causal poses, relative to the other slices as they were at that moment, in the first stack and from the
+  /// second on.
+  RadiusScore radius_one_stack, radius;
+  std::size_t network_starts = 0;  ///< live: slices that were registered from where the network had put them
 };
 
 /// Everything but the scan.

@@ -8,6 +8,7 @@
 
 #include "svort_ros/geometry/image_grid.h"
 #include "svort_ros/geometry/pose.h"
+#include "svort_ros/network/network_cache_options.h"
 #include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/registration/incremental_refinement.h"
 #include "svort_ros/registration/pose_refinement.h"
@@ -37,7 +38,8 @@ struct SliceEstimate {
   double ncc = 0.;
   PoseStatus status = PoseStatus::nominal;
   std::string reason;  ///< why the weight is 0; empty otherwise
-  /// What the slice was first registered from: "prediction", "stack begin" or "scan begin". Empty: it was not.
+  /// What the slice was first registered from: "prediction", "stack begin", "scan begin", "network" or "network image".
+  /// Empty: it was not.
   std::string start;
   /// 95 % of slices lie closer to their true place than this, relative to the others (root mean square over the head),
   /// mm; see docs/live.md for how it is calibrated. NaN while unknown.
@@ -54,8 +56,9 @@ struct Estimate {
   bool final = false;                 ///< set by finalise(), until the next slice
 };
 
-/// For the method "network".
+/// For the method "network", and for the live network as one of the candidates of the method "registration".
 struct NetworkEstimatorOptions {
+  bool candidate = false;             ///< method "registration": the live network says where a new slice may be, too
   std::string weights;                ///< file of weights, see svort_checkpoint; its network is the one that runs
   std::string name;                   ///< if not empty, the network that the file must hold
   std::string when = "scan_end";      ///< "every_arrival" runs it causally, over the slices so far, if there is time
@@ -67,9 +70,11 @@ struct NetworkEstimatorOptions {
   std::string formulation = "exact";
   /// Of the volume that the network sees. Versions 1 and 2 of SVoRT were trained at 0.8 mm.
   double volume_resolution_mm = 0.8;
+  NetworkCacheOptions cache;  ///< with `candidate`
 
   template <class Visitor>
   void visit(Visitor&& v) {
+    v("candidate", candidate, "method registration: the live network says where a new slice may be, too");
     v("weights", weights, "file of weights; its network is the one that runs");
     v("name", name, "if not empty, the network that the file must hold: v1, v2, ..");
     v("when", when, "scan_end, or every_arrival: causally, over the slices so far");
@@ -78,6 +83,7 @@ struct NetworkEstimatorOptions {
     v("iterations", iterations, "transformation updates; 0: as many as the network was made for");
     v("formulation", formulation, "forward model inside the network: exact, or fast, which changes its poses a little");
     v("volume_resolution_mm", volume_resolution_mm, "voxel size of the volume that the network sees, mm");
+    v.section("cache", cache);
   }
 };
 

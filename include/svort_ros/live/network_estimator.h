@@ -39,9 +39,8 @@ class NetworkEstimator : public NominalEstimator {
   int iterations_ = 0;
   NetworkGrid grid_;
   AcquisitionFormulation formulation_;
+  EstimatorNotes notes_;
   NetworkRunner runner_;
-  std::string weights_sha256_;
-  bool untrained_ = false;
   bool poses_are_the_networks_ = false;
 };
 

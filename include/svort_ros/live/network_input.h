@@ -25,4 +25,8 @@ struct SequenceInput {
 /// @throws std::invalid_argument if the sequence is empty
 SequenceInput network_input(const SliceSequence& sequence, bool common_frame);
 
+/// What network_input() with a common frame says beside the images: `slices` stays undefined.
+/// @throws std::invalid_argument if the sequence is empty
+NetworkInput network_geometry(const SliceSequence& sequence);
+
 }  // namespace svort

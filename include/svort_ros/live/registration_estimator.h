@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "svort_ros/acquisition/slice_acquisition.h"
+#include "svort_ros/live/candidate_source.h"
 #include "svort_ros/live/incremental_estimator.h"
 
 namespace svort {
@@ -15,8 +16,8 @@ namespace svort {
 ///
 /// add() takes the new slice's pose from the head's motion at its neighbour in time and registers it, the newest slices
 /// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() refines all of them,
-/// from the coarsest level on, from these poses and from the scanner's, and keeps what fits better. Poses depend on the
-/// slices and their order alone.
+/// from the coarsest level on, from the scanner's poses, and from these only if that fits clearly better. Poses depend
+/// on the slices and their order alone.
 ///
 /// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
 /// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
@@ -24,8 +25,10 @@ namespace svort {
 class RegistrationEstimator : public IncrementalEstimator {
  public:
   /// @param templates brains in canonical orientation; may be empty
+  /// @param source    more candidates for each new slice; may be null
   /// @throws std::invalid_argument naming the option that is out of range
-  RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates);
+  RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates,
+                        std::unique_ptr<CandidateSource> source = nullptr);
 
   void add(const SliceSequence& sequence) override;
   void update_volume(const SliceSequence& sequence) override;
@@ -35,6 +38,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   const Estimate& estimate() const override { return estimate_; }
   const Volume& volume() const override { return volume_; }
   std::string device() const override { return "cpu"; }
+  EstimatorNotes notes() const override { return source_ ? source_->notes() : EstimatorNotes(); }
 
  private:
   std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
@@ -50,6 +54,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   AcquisitionFormulation formulation_;
   ImageGrid grid_;
   std::vector<BrainTemplate> templates_;
+  std::unique_ptr<CandidateSource> source_;
   std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
   std::size_t idle_left_ = 0;   ///< windows that improve() may still register again before the next slice
   double idle_motion_mm_ = 0.;  ///< largest mean motion of a window in this sweep of improve()

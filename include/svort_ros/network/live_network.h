@@ -135,6 +135,17 @@ class LiveNetwork : public PoseNetwork {
   LiveOutput update(const torch::Tensor& simulated, const NetworkInput& input,
                     const std::vector<std::int64_t>& lengths = {}, std::vector<torch::Tensor>* attention = nullptr);
 
+  /// update() in two steps, so that features may be kept. Features of slices at their places, for the shared network;
+  /// row i depends on slice i, its place and the volume alone.
+  /// @param reduced   n x 1 x input_px x input_px, reduce()
+  /// @param simulated as for update()
+  /// @return n x dim
+  torch::Tensor encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated);
+  /// Shared network: all slices together. @param features n x dim, from encode_placed(); the rest as for update()
+  LiveOutput attend_placed(const torch::Tensor& features, const NetworkInput& input,
+                           const std::vector<std::int64_t>& lengths = {},
+                           std::vector<torch::Tensor>* attention = nullptr);
+
   /// Slices as the network sees them: n x 1 x input_px x input_px, averaged, not normalised.
   torch::Tensor reduce(const torch::Tensor& slices, double resolution_mm) const;
 
@@ -166,6 +177,13 @@ torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const torch::
                                      const LiveNetworkOptions& options, double thickness_mm,
                                      AcquisitionFormulation formulation);
 constexpr double kLiveNormalStepMm = 3.;
+
+/// The same in a volume that is there already.
+/// @param geometry of the slices as `reduced` has them, in the volume's voxels; see geometry_of_poses()
+/// @param volume   d x d x d, float32, CPU, in the slices' unit
+/// @param voxel_mm its voxel size
+torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const AcquisitionGeometry& geometry,
+                                     const torch::Tensor& volume, double voxel_mm, AcquisitionFormulation formulation);
 
 /// Places after an update of the shared network.
 /// @param transforms n x 3 x 4, current places; @param points n x 9, LiveOutput::points of update()

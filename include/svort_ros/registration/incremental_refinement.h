@@ -71,6 +71,16 @@ class IncrementalRefinement {
   /// @param bright   intensity of bright tissue (0.99 quantile), in the slices' unit
   void insert(std::size_t position, const IncrementalSlice& slice, const Pose& T_brain_slice, double bright);
 
+  /// Whether choose() compares candidates now: there is a volume, and more than one stack.
+  bool compares() const;
+
+  /// PSF reconstruction of the slices that take part, weighted, at their poses; a cube centred on the brain frame's
+  /// origin. Undefined while none does. Do not write to it.
+  /// @return d x d x d, float32, in the slices' unit
+  torch::Tensor volume();
+  /// Its voxel size. Known once there is a slice.
+  double voxel_mm() const;
+
   /// Registers the slice alone to the others' volume, from each candidate; sets its pose to the best and says which.
   /// The first candidate wins unless another one correlates better by candidate_margin. Without a volume the first one
   /// is taken as it is.
