@@ -237,7 +237,9 @@ int run_svort_replay(int argc, char** argv) {
   app.add_option("--threads", options.server.node.threads, "threads of the estimator; 0 takes all cores")
       ->capture_default_str();
   svort::NetworkEstimatorOptions& network = options.server.pipeline.estimator.network;
-  CLI::Option* weights = app.add_option("--weights", network.weights, "run the network of this file (method network; with --estimator.network.candidate true: registration)");
+  CLI::Option* weights = app.add_option(
+      "--weights", network.weights,
+      "run the network of this file (method network; with --estimator.network.candidate true: registration)");
   CLI::Option* name =
       app.add_option("--network", network.name, "run this network (method network): v1, v2, ..; the file must hold it");
   app.add_option("--device", network.device, "where the network runs: auto, cpu or cuda; all else is on the CPU")
