@@ -20,7 +20,6 @@ namespace {
 constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to register to
 constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
 constexpr std::size_t kSlicesBetweenMatches = 15;
-constexpr double kFollowedGain = 0.01;  // of the cost: less is a matter of where the last pass stopped
 constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
@@ -257,12 +256,10 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
   if (estimate_.slices.size() >= kFewestSlices) {
     const RegistrationInput input = registration_input(sequence);
     const std::vector<Pose> current = crop_poses(sequence);
-    // From the scanner's poses, so that the end does not depend on the way; from where the way has led only if that
-    // fits clearly better. `take` brings it into the frame that is there.
-    Refinement end = register_scan(input, {input.T_world_slice}, options_.volume_size_mm, options_.registration,
-                                   options_.template_match);
-    Refinement followed = refine_poses(input, current, options_.registration);
-    if (followed.report.last_cost < (1. - kFollowedGain) * end.report.last_cost) end = std::move(followed);
+    // From the scanner's poses, so that the end does not depend on the way; `take` brings it into the frame that is
+    // there.
+    const Refinement end = register_scan(input, {input.T_world_slice}, options_.volume_size_mm, options_.registration,
+                                         options_.template_match);
     take(sequence, end, current);
     if (incremental_) {
       tell_incremental(sequence);

@@ -77,6 +77,8 @@ TEST(RegistrationEstimator, RegistersAllSlicesAgainIfAskedTo) {
   const double nominal = relative_error_mm(a.nominal, a.truth);
   EXPECT_LT(relative_error_mm(a.estimated, a.truth), 0.6 * nominal);
   EXPECT_LT(relative_error_mm(b.estimated, b.truth), 0.6 * nominal);
+  // The frame, which the way there has left, is rounded differently.
+  EXPECT_LT(relative_error_mm(a.estimated, b.estimated), 1e-6) << "the end does not depend on the way";
   EXPECT_TRUE(full.estimate().slices.back().start.empty()) << "what only the incremental update knows";
   EXPECT_FALSE(incremental.estimate().slices.back().start.empty());
 }

@@ -15,9 +15,8 @@ namespace svort {
 /// one trajectory in acquisition order (see refine_poses), and the whole to a template, if there is one.
 ///
 /// add() takes the new slice's pose from the head's motion at its neighbour in time and registers it, the newest slices
-/// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() refines all of them,
-/// from the coarsest level on, from the scanner's poses, and from these only if that fits clearly better. Poses depend
-/// on the slices and their order alone.
+/// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() registers all of them
+/// from the scanner's poses, as a batch run does (register_scan). Poses depend on the slices and their order alone.
 ///
 /// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
 /// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
