@@ -5,6 +5,17 @@
 #include <stdexcept>
 
 namespace svort {
+namespace {
+
+double memory_mb(const std::string& key) {
+  std::ifstream status("/proc/self/status");
+  for (std::string line; std::getline(status, line);) {
+    if (line.rfind(key, 0) == 0) return std::stod(line.substr(key.size())) / 1024.;
+  }
+  throw std::runtime_error("/proc/self/status has no line " + key);
+}
+
+}  // namespace
 
 std::vector<std::string> list_items(const std::string& text) {
   std::vector<std::string> list;
@@ -36,12 +47,8 @@ std::string processor() {
   return "unknown processor";
 }
 
-double peak_memory_mb() {
-  std::ifstream status("/proc/self/status");
-  for (std::string line; std::getline(status, line);) {
-    if (line.rfind("VmHWM:", 0) == 0) return std::stod(line.substr(6)) / 1024.;
-  }
-  throw std::runtime_error("/proc/self/status has no line VmHWM");
-}
+double resident_memory_mb() { return memory_mb("VmRSS:"); }
+
+double peak_memory_mb() { return memory_mb("VmHWM:"); }
 
 }  // namespace svort

@@ -18,7 +18,8 @@ std::vector<std::int64_t> positive_integers(const std::string& name, const std::
 /// Model name of the processor.
 std::string processor();
 
-/// Largest resident memory of this process, in MB.
+/// Resident memory of this process, now and at its largest, in MB.
+double resident_memory_mb();
 double peak_memory_mb();
 
 }  // namespace svort

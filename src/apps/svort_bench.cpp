@@ -1,5 +1,6 @@
 // Benchmarks of the core, one JSON object per line. `svort_bench forward` measures the acquisition operator,
-// `svort_bench network` the pose networks (network_bench.cpp), `svort_bench live` the live pipeline (live_bench.cpp).
+// `svort_bench network` the pose networks (network_bench.cpp), `svort_bench live` the live pipeline (live_bench.cpp),
+// `svort_bench memory` what the pipeline holds on to (memory_bench.cpp).
 
 #include <ATen/Parallel.h>
 #include <sys/resource.h>
@@ -22,6 +23,7 @@
 
 #include "bench_support.h"
 #include "live_bench.h"
+#include "memory_bench.h"
 #include "network_bench.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/acquisition/slice_acquisition.h"
@@ -70,7 +72,7 @@ constexpr int kSize = 128;  // pixels along each side of a slice
 
 Options parse(const std::vector<std::string>& arguments) {
   if (arguments.empty() || arguments[0] != "forward")
-    throw UsageError("the first argument must be forward, network or live");
+    throw UsageError("the first argument must be forward, network, live or memory");
   Options options;
   for (std::size_t i = 1; i < arguments.size(); i += 2) {
     const std::string& name = arguments[i];
@@ -422,12 +424,16 @@ void run(const Options& options) {
   print_table(by_size, /*with_size=*/true, std::cout);
 }
 
+std::string usage() {
+  return std::string(kUsage) + svort::kNetworkBenchUsage + svort::kLiveBenchUsage + svort::kMemoryBenchUsage;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
   const std::vector<std::string> arguments(argv + 1, argv + argc);
   if (arguments.size() == 1 && (arguments[0] == "--help" || arguments[0] == "-h")) {
-    std::cout << kUsage << svort::kNetworkBenchUsage << svort::kLiveBenchUsage;
+    std::cout << usage();
     return 0;
   }
   try {
@@ -435,11 +441,12 @@ int main(int argc, char** argv) {
       svort::run_network_bench({arguments.begin() + 1, arguments.end()});
     else if (!arguments.empty() && arguments[0] == "live")
       svort::run_live_bench({arguments.begin() + 1, arguments.end()});
+    else if (!arguments.empty() && arguments[0] == "memory")
+      svort::run_memory_bench({arguments.begin() + 1, arguments.end()});
     else
       run(parse(arguments));
   } catch (const UsageError& error) {
-    std::cerr << "svort_bench: " << error.what() << "\n"
-              << kUsage << svort::kNetworkBenchUsage << svort::kLiveBenchUsage;
+    std::cerr << "svort_bench: " << error.what() << "\n" << usage();
     return 2;
   } catch (const std::invalid_argument& error) {
     std::cerr << "svort_bench: " << error.what() << "\n";

@@ -11,6 +11,7 @@
 namespace svort {
 namespace {
 
+constexpr double kTiny = std::numeric_limits<double>::min();
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 constexpr double kBlockMm = 3.;             // about a slice's thickness: finer would only add noise
 constexpr double kVoidShare = 0.6;          // a block is void below this share of what is expected there
@@ -19,6 +20,8 @@ constexpr double kBrightEnough = 0.2;       // of the scan's scale; darker place
 constexpr int kNeighbours = 2;              // slices of the stack on either side
 constexpr std::size_t kFewestBlocks = 8;
 constexpr double kJumpMm = 2.;
+constexpr double kLeastNoise = 1e-3;  // of the scan's scale: less does not matter
+constexpr double kUsualSpread = 2.;   // median absolute deviations: what a scan's own anatomy and contrast explain
 
 double median(std::vector<double> values) {
   if (values.empty()) return kNaN;
@@ -31,6 +34,20 @@ double quantile(std::vector<double> values, double q) {
   const auto rank = values.begin() + static_cast<std::ptrdiff_t>(q * static_cast<double>(values.size() - 1));
   std::nth_element(values.begin(), rank, values.end());
   return *rank;
+}
+
+/// By how much each value is above what is usual in the scan; 0 within that. Damage of up to half of the slices leaves
+/// the measure as it is.
+std::vector<double> above_usual(const std::vector<double>& values) {
+  const double middle = median(values);
+  std::vector<double> deviations;
+  deviations.reserve(values.size());
+  for (const double value : values) deviations.push_back(std::abs(value - middle));
+  const double limit = middle + kUsualSpread * median(deviations);
+  std::vector<double> above;
+  above.reserve(values.size());
+  for (const double value : values) above.push_back(std::max(0., value - limit));
+  return above;
 }
 
 /// Trilinear; NaN outside of the grid.
@@ -268,16 +285,16 @@ const std::vector<SliceQuality>& QualityMonitor::update(const SliceSequence& seq
   blocks_.clear();
   slices_.assign(count, {});
   std::map<std::pair<int, int>, std::size_t> place;  // stack and index -> which slice
-  std::vector<double> noises;
+  std::vector<double> log_noises;
   for (std::size_t i = 0; i < count; ++i) {
     const auto key = std::make_pair(prepared[i]->info.stack, prepared[i]->info.index);
     std::shared_ptr<const SliceBlocks>& cached = cache_[key];
     if (!cached) cached = std::make_shared<const SliceBlocks>(make_blocks(*prepared[i]));
     blocks_.push_back(cached);
     place[key] = i;
-    noises.push_back(cached->noise);
+    log_noises.push_back(std::log(std::max({cached->noise, kLeastNoise * scale, kTiny})));
   }
-  const double usual_noise = median(noises);
+  const std::vector<double> noises = above_usual(log_noises);
 
   std::map<int, std::vector<double>> gains;  // against the volume, by stack
   std::vector<Loss> against_volume(count);
@@ -287,6 +304,21 @@ const std::vector<SliceQuality>& QualityMonitor::update(const SliceSequence& seq
     against_volume[i] = loss_against(*blocks_[i], slice.T_brain_slice, slice.info.thickness, scale, volume);
     if (std::isfinite(against_volume[i].gain)) gains[slice.info.stack].push_back(against_volume[i].gain);
   }
+
+  std::vector<double> void_shares;
+  std::vector<Loss> against_neighbours;
+  for (std::size_t i = 0; i < count; ++i) {
+    const SliceInfo& info = estimate.slices[i].info;
+    std::vector<std::pair<const SliceBlocks*, const SliceInfo*>> neighbours;
+    for (int step = -kNeighbours; step <= kNeighbours; ++step) {
+      const auto found = place.find({info.stack, info.index + step});
+      if (step != 0 && found != place.end())
+        neighbours.emplace_back(blocks_[found->second].get(), &estimate.slices[found->second].info);
+    }
+    against_neighbours.push_back(loss_against(*blocks_[i], info, scale, neighbours));
+    void_shares.push_back(or_typical(against_neighbours[i].void_share, kTypical.void_image));
+  }
+  void_shares = above_usual(void_shares);
 
   for (std::size_t i = 0; i < count; ++i) {
     const SliceEstimate& slice = estimate.slices[i];
@@ -302,16 +334,9 @@ const std::vector<SliceQuality>& QualityMonitor::update(const SliceSequence& seq
                         ? loss_log(against_volume[i].gain / median(gains[slice.info.stack]))
                         : kNaN;
 
-    std::vector<std::pair<const SliceBlocks*, const SliceInfo*>> neighbours;
-    for (int step = -kNeighbours; step <= kNeighbours; ++step) {
-      const auto found = place.find({slice.info.stack, slice.info.index + step});
-      if (step != 0 && found != place.end())
-        neighbours.emplace_back(blocks_[found->second].get(), &estimate.slices[found->second].info);
-    }
-    const Loss against_neighbours = loss_against(*blocks_[i], slice.info, scale, neighbours);
-    f.void_image = or_typical(against_neighbours.void_share, kTypical.void_image);
-    f.dark_image = loss_log(against_neighbours.gain);
-    f.noise = usual_noise > 0. && blocks_[i]->noise > usual_noise ? std::log(blocks_[i]->noise / usual_noise) : 0.;
+    f.void_image = void_shares[i];
+    f.dark_image = loss_log(against_neighbours[i].gain);
+    f.noise = noises[i];
 
     // A jump that comes back is out of range; a step that stays may be the head's. The newest has no slice after it.
     double jump = std::numeric_limits<double>::infinity();

@@ -66,6 +66,24 @@ TEST(SliceQuality, AHoleIsAVoid) {
   EXPECT_FALSE(has(changed(all), QualityReason::noise));
 }
 
+TEST(SliceQuality, WhatIsUsualInTheScanIsNoDamage) {
+  // Anatomy that changes from slice to slice, as where dark tissue follows bright fluid: a dark spot of another size in
+  // every slice. One slice has lost more.
+  LivePipeline pipeline(svort_test::quick_pipeline());
+  for (int stack = 0; stack < 3; ++stack)
+    for (ScanSlice slice : svort_test::whole_stack(stack, stack, 30. * stack)) {
+      slice.hole_mm = stack == 1 && slice.index == 8 ? 20. : slice.index % 2 == 0 ? 4. : 8. + slice.index % 3;
+      pipeline.add(svort_test::make_slice(slice));
+    }
+  QualityMonitor monitor(svort_test::plain_quality());
+  const auto& all = monitor.update(pipeline.sequence(), pipeline.estimate(), Volume(), 30.);
+  EXPECT_TRUE(has(changed(all), QualityReason::signal_void)) << changed(all).features.void_image;
+  const auto spoilt =
+      std::count_if(all.begin(), all.end(), [](const SliceQuality& slice) { return slice.features.void_image > 0.; });
+  // About half of the slices have a larger spot than their neighbours.
+  EXPECT_LT(static_cast<std::size_t>(spoilt), all.size() / 5) << "of " << all.size();
+}
+
 TEST(SliceQuality, ANoisySliceIsNoise) {
   const auto all = score([](ScanSlice& slice) { slice.noise = 150.; });
   EXPECT_GT(changed(all).features.noise, 1.);
