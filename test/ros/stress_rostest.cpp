@@ -25,17 +25,18 @@ namespace {
 using svort_test::Collector;
 using svort_test::eventually;
 
-constexpr std::size_t kBurst = 30;  // slices
+constexpr std::size_t kBurst = 30;      // slices
+constexpr int kPauseMs = 300;           // between calls that make the server compute or write for long
+constexpr double kLongPatience = 120.;  // s; instrumented, and on a busy machine
 
-/// Slices of 16 x 14 pixels, so that the server's own work, not the images', takes the time.
+/// Slices of 20 x 20 pixels, so that the server's own work, not the images', takes the time.
 std::vector<Slice> small_messages(const std::string& scan_id, int slices_per_stack) {
   svort_test::SyntheticScanOptions options;
   options.scan_id = scan_id;
-  options.slices_per_stack = slices_per_stack;
-  options.columns = 16;
-  options.rows = 14;
-  options.pixel_mm = 5.;
-  options.thickness_mm = 42. / slices_per_stack;
+  options.slices = slices_per_stack;
+  options.pixels = 20;
+  options.pixel_mm = 4.;
+  options.thickness_mm = 48. / slices_per_stack;
   std::vector<Slice> messages;
   for (const svort::Slice& slice : svort_test::synthetic_scan(options)) messages.push_back(to_msg(slice, "scanner"));
   return messages;
@@ -46,14 +47,21 @@ class StressTest : public testing::Test {
   void SetUp() override {
     ros::param::set("svort/node/output_directory", folder_.path().string());
     ros::param::set("svort/node/threads", 2);
-    ros::param::set("svort/sequence/size_px", 16);
-    ros::param::set("svort/sequence/resolution_mm", 5.);
+    ros::param::set("svort/sequence/size_px", 20);
+    ros::param::set("svort/sequence/resolution_mm", 4.);
     ros::param::set("svort/sequence/min_brain_pixels", 4);
     ros::param::set("svort/estimator/budget", "time");  // poses are improved while nothing arrives
-    ros::param::set("svort/estimator/volume_resolution_mm", 5.);
-    ros::param::set("svort/estimator/volume_size_mm", 90.);
-    ros::param::set("svort/estimator/registration/finest_mm", 5.);
-    ros::param::set("svort/estimator/final_volume/resolution_mm", 5.);
+    ros::param::set("svort/estimator/volume_resolution_mm", 4.);
+    ros::param::set("svort/estimator/volume_size_mm", 88.);
+    ros::param::set("svort/estimator/registration/finest_mm", 4.);
+    ros::param::set("svort/estimator/registration/stack_passes", 1);
+    ros::param::set("svort/estimator/registration/trajectory_passes", 1);
+    ros::param::set("svort/estimator/incremental/window", 4);
+    ros::param::set("svort/estimator/template_match/rotations", 50);
+    ros::param::set("svort/estimator/template_match/refined", 2);
+    ros::param::set("svort/estimator/template_match/samples", 200);
+    ros::param::set("svort/estimator/final_volume/resolution_mm", 4.);
+    ros::param::set("svort/estimator/final_volume/passes", 1);
     ros::param::set("svort/decision/coverage/resolution_mm", 8.);
   }
   void TearDown() override { ros::param::del("svort"); }
@@ -65,16 +73,16 @@ class StressTest : public testing::Test {
   svort_test::TemporaryFolder folder_;
 };
 
-/// Threads that repeat something until the object ends.
+/// Threads that repeat something, with a pause, until the object ends.
 class Repeaters {
  public:
   ~Repeaters() { stop(); }
   template <class Action>
-  void add(const Action& action) {
-    threads_.emplace_back([this, action] {
+  void add(const Action& action, int pause_ms = 5) {
+    threads_.emplace_back([this, action, pause_ms] {
       for (int round = 0; !stop_; ++round) {
         action(round);
-        std::this_thread::sleep_for(std::chrono::milliseconds(3));
+        std::this_thread::sleep_for(std::chrono::milliseconds(pause_ms));
       }
     });
   }
@@ -117,7 +125,7 @@ void look_at_everything() {
 }
 
 /// Sends the slices from one thread each stack, as fast as it goes. @return how many
-std::size_t send_from_three_threads(const svort_test::NodeClient& client, const std::vector<Slice>& slices) {
+std::size_t send_from_three_threads(svort_test::NodeClient& client, const std::vector<Slice>& slices) {
   std::vector<std::thread> senders;
   for (int stack = 0; stack < 3; ++stack)
     senders.emplace_back([&client, &slices, stack] {
@@ -141,25 +149,27 @@ TEST_F(StressTest, ManyThreadsAtOnceLoseNothing) {
   std::size_t sent = 0;
   {
     Repeaters users;
-    users.add([&](int round) {
-      const char* const services[] = {kFinaliseService, kSaveService, kResetService, kFinaliseService};
-      count(trigger(services[round % 4]));
-    });
+    users.add(
+        [&](int round) {
+          const char* const services[] = {kFinaliseService, kSaveService, kFinaliseService, kResetService};
+          count(trigger(services[round % 4]));
+        },
+        kPauseMs);
     users.add([&](int round) { count(change_threshold(round % 3 == 2 ? -1. : 0.3 + 0.01 * (round % 20))); });
     users.add([&](int) {
       Veto veto;
       veto.request.reason = "stress";
       count(ros::service::call("svort/veto", veto));
     });
-    users.add([](int) { look_at_everything(); });
+    users.add([](int) { look_at_everything(); }, kPauseMs);
     // New scans end old ones in the middle, and some slices come twice.
-    for (int scan = 0; scan < 4; ++scan) {
+    for (int scan = 0; scan < 3; ++scan) {
       auto slices = small_messages("storm_" + std::to_string(scan), static_cast<int>(kBurst) / 3);
       slices.insert(slices.end(), slices.begin(), slices.begin() + 6);
       sent += send_from_three_threads(client, slices);
-      ASSERT_TRUE(eventually([&] { return client.status().count() + kBurst / 2 >= sent; }, 60.));
+      ASSERT_TRUE(eventually([&] { return client.status().count() + kBurst / 2 >= sent; }, kLongPatience));
     }
-    ASSERT_TRUE(eventually([&] { return client.status().count() >= sent && calls >= 20; }, 60.))
+    ASSERT_TRUE(eventually([&] { return client.status().count() >= sent && calls >= 12; }, kLongPatience))
         << client.status().count() << " of " << sent << " answers, " << calls << " calls";
   }
   EXPECT_EQ(unanswered, 0U) << "of " << calls << " calls";
@@ -171,7 +181,7 @@ TEST_F(StressTest, ManyThreadsAtOnceLoseNothing) {
   client.status().clear();
   sent = send_from_three_threads(client, small_messages("calm", static_cast<int>(kBurst) / 3));
   ASSERT_EQ(sent, kBurst);
-  ASSERT_TRUE(eventually([&] { return client.status().count() >= sent; }, 60.));
+  ASSERT_TRUE(eventually([&] { return client.status().count() >= sent; }, kLongPatience));
   std::map<std::pair<int, int>, int> answers;
   for (const SliceStatus& status : client.status().all()) {
     EXPECT_TRUE(status.kept) << status.reason;
@@ -186,20 +196,21 @@ TEST_F(StressTest, ManyThreadsAtOnceLoseNothing) {
 
 TEST_F(StressTest, EndsWhileEverybodyIsBusy) {
   svort_test::NodeClient client;
-  for (int round = 0; round < 3; ++round) {
+  for (int round = 0; round < 2; ++round) {
     auto server = make_server();
     ASSERT_TRUE(client.connect());
     const auto slices = small_messages("end_" + std::to_string(round), static_cast<int>(kBurst) / 3);
     Repeaters users;
     users.add([&](int) { send_from_three_threads(client, slices); });
-    users.add([](int) { trigger(kFinaliseService); });  // fails once the server is gone
-    users.add([](int) { trigger(kSaveService); });
+    users.add([](int) { trigger(kFinaliseService); }, kPauseMs);  // fails once the server is gone
+    users.add([](int) { trigger(kSaveService); }, kPauseMs);
     users.add([](int i) { change_threshold(0.3 + 0.01 * (i % 20)); });
     users.add([](int) { look_at_everything(); });
     client.status().clear();
     ASSERT_TRUE(eventually([&] { return client.status().count() >= 5; }));
     auto end = std::async(std::launch::async, [&] { server.reset(); });
-    ASSERT_EQ(end.wait_for(std::chrono::seconds(60)), std::future_status::ready) << "the server hangs";
+    ASSERT_EQ(end.wait_for(std::chrono::duration<double>(kLongPatience)), std::future_status::ready)
+        << "the server hangs";
     users.stop();
     EXPECT_TRUE(std::filesystem::exists(folder_.path() / ("end_" + std::to_string(round)) / "poses.csv"));
   }
@@ -241,8 +252,10 @@ TEST_F(StressTest, FiveThousandSlicesDoNotGrow) {
       publisher.publish(slice);
     }
     sent += slices.size();
-    ASSERT_TRUE(eventually([&] { return answered >= sent; }, 60.)) << answered << " of " << sent;
-    if (scan % 5 == 4) ASSERT_TRUE(trigger(kResetService));
+    ASSERT_TRUE(eventually([&] { return answered >= sent; }, kLongPatience)) << answered << " of " << sent;
+    if (scan % 5 == 4) {
+      ASSERT_TRUE(trigger(kResetService));
+    }
     if (before == 0. && sent >= kSlices / 5) before = resident_mb();  // the allocator has settled
   }
   ASSERT_GT(before, 0.);
@@ -250,7 +263,7 @@ TEST_F(StressTest, FiveThousandSlicesDoNotGrow) {
   const double growth = resident_mb() - before;
   RecordProperty("growth_mb", std::to_string(growth));
   std::cout << sent << " slices, " << before << " MB after a fifth of them, " << growth << " MB more at the end\n";
-  // A slice that stayed would be 1.3 kB as it is kept, 5 MB in all; what the allocator holds back varies by 1 to 2 MB.
+  // A slice that stayed would be 2 kB as it is kept, 8 MB in all; what the allocator holds back varies by 1 to 2 MB.
   EXPECT_LT(growth, 4.);
 }
 
