@@ -201,7 +201,7 @@ TEST_F(StressTest, EndsWhileEverybodyIsBusy) {
     ASSERT_TRUE(client.connect());
     const auto slices = small_messages("end_" + std::to_string(round), static_cast<int>(kBurst) / 3);
     Repeaters users;
-    users.add([&](int) { send_from_three_threads(client, slices); });
+    users.add([&](int) { send_from_three_threads(client, slices); }, kPauseMs);
     users.add([](int) { trigger(kFinaliseService); }, kPauseMs);  // fails once the server is gone
     users.add([](int) { trigger(kSaveService); }, kPauseMs);
     users.add([](int i) { change_threshold(0.3 + 0.01 * (i % 20)); });
