@@ -24,9 +24,9 @@ constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to regis
 constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
 constexpr std::size_t kSlicesBetweenMatches = 15;
 constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
-constexpr double kMovingMm = 2.;       // from slice to slice; a head that moves less is at rest
+constexpr double kMovingMm = 2.;        // from slice to slice; a head that moves less is at rest
 constexpr double kBetterAgreement = 0.003;
-constexpr double kElsewhereMm = 5.;    // what a search moves by more has been found elsewhere
+constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
 double half_field_mm(const SliceSequence& sequence) {
@@ -178,8 +178,7 @@ void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std:
     before.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
     after.push_back(incremental_->slices()[i].T_brain_slice);
   }
-  publish_incremental(sequence,
-                      before.empty() ? Pose::Identity() : fit_planes(after, before, half_field_mm(sequence)));
+  publish_incremental(sequence, before.empty() ? Pose::Identity() : fit_planes(after, before, half_field_mm(sequence)));
 }
 
 void RegistrationEstimator::publish_incremental(const SliceSequence& sequence, const Pose& T_brain_engine) {

@@ -166,8 +166,8 @@ class IncrementalRefinement::Engine {
       }
       std::vector<RefinedSlice> run;
       for (std::size_t i = from; i <= position; ++i) run.push_back(settled(i, piece.poses[i - from], 1, 2.));
-      const double away_mm = motion_size(
-          twist_of(run.back().T_brain_slice * slices_[position].T_brain_slice.inverse()), refinement_.lever_mm);
+      const double away_mm = motion_size(twist_of(run.back().T_brain_slice * slices_[position].T_brain_slice.inverse()),
+                                         refinement_.lever_mm);
       if (!(run.back().ncc > std::max(best_ncc, here_ncc + kLostMargin + kLostMarginPerMm * away_mm))) continue;
       best_ncc = run.back().ncc;
       // Of a run those stay that were in their places.
@@ -261,13 +261,13 @@ class IncrementalRefinement::Engine {
     Pose T_world_slice;
     int stack = 0;
     double thickness_mm = 3.;
-    torch::Tensor pixels, mask;   ///< 1 x 1 x s x s
-    SlicePoints points[kLevels];  ///< blurred
+    torch::Tensor pixels, mask;           ///< 1 x 1 x s x s
+    SlicePoints points[kLevels];          ///< blurred
     torch::Tensor outline, outline_mask;  ///< coarse, with the brain's outline, to look for it far away
     SlicePoints outline_points;
-    bool lost = false;            ///< fits nowhere: shows nothing to the others
-    bool entered = false;         ///< takes part in the volume, if its weight is not 0
-    bool in_volume = false;       ///< its terms are in the sums, at this pose and weight
+    bool lost = false;       ///< fits nowhere: shows nothing to the others
+    bool entered = false;    ///< takes part in the volume, if its weight is not 0
+    bool in_volume = false;  ///< its terms are in the sums, at this pose and weight
     Pose volume_pose = Pose::Identity();
     double volume_weight = 0.;
   };
@@ -276,7 +276,8 @@ class IncrementalRefinement::Engine {
   double usual_ncc(std::size_t position) const {
     std::vector<double> ncc;
     for (std::size_t i = 0; i < slices_.size(); ++i)
-      if (i != position && kept_[i].entered && slices_[i].weight > 0. && std::isfinite(slices_[i].ncc)) ncc.push_back(slices_[i].ncc);
+      if (i != position && kept_[i].entered && slices_[i].weight > 0. && std::isfinite(slices_[i].ncc))
+        ncc.push_back(slices_[i].ncc);
     if (ncc.empty()) return 0.;
     const auto middle = ncc.begin() + static_cast<std::ptrdiff_t>(ncc.size() / 2);
     std::nth_element(ncc.begin(), middle, ncc.end());
@@ -325,7 +326,8 @@ class IncrementalRefinement::Engine {
     }
     const auto size = static_cast<std::int64_t>(std::ceil(volume_size_mm_ / outline_pixel_mm_)) + 6;
     if (poses.empty())
-      return faded_volume({torch::zeros({size, size, size}), torch::zeros({size, size, size})}, outline_pixel_mm_, centre);
+      return faded_volume({torch::zeros({size, size, size}), torch::zeros({size, size, size})}, outline_pixel_mm_,
+                          centre);
     const SliceAcquisition acquisition =
         cube_acquisition(torch::cat(masks), poses, thickness_mm, outline_pixel_mm_, size, outline_pixel_mm_);
     return faded_volume(weighted_volume(torch::cat(slices), acquisition, weights), outline_pixel_mm_, centre);

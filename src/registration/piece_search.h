@@ -31,8 +31,8 @@ double piece_correlation(const Piece& piece, const Pose& motion, const SampledVo
 /// Centre of brightness, mm.
 Eigen::Vector3d piece_centre(const Piece& piece);
 
-/// The motion, close to `start`, after which the differences of piece and volume are smallest; each slice with a gain and
-/// an offset of its own.
+/// The motion, close to `start`, after which the differences of piece and volume are smallest; each slice with a gain
+/// and an offset of its own.
 Pose refine_piece(const Piece& piece, const SampledVolume& volume, Pose start = Pose::Identity());
 
 /// Where the piece fits the volume best: as it is, after one of the motions, or after a turn by up to `reach_rad` (at

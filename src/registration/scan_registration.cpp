@@ -94,9 +94,8 @@ class Trials {
     RefinementOptions with = judged_;
     with.image_trust = std::min(1., trust * asked_.image_trust);
     const auto same = [&](const auto& tried) {
-      return tried.second == trust &&
-             std::equal(start.begin(), start.end(), tried.first.begin(), tried.first.end(),
-                        [](const Pose& a, const Pose& b) { return a.matrix() == b.matrix(); });
+      return tried.second == trust && std::equal(start.begin(), start.end(), tried.first.begin(), tried.first.end(),
+                                                 [](const Pose& a, const Pose& b) { return a.matrix() == b.matrix(); });
     };
     if (std::any_of(tried_.begin(), tried_.end(), same)) return;
     tried_.emplace_back(start, trust);

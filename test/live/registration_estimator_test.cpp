@@ -145,8 +145,8 @@ double followed_error_mm(LivePipeline& pipeline, const Scan& scan) {
 
 std::size_t found(const LivePipeline& pipeline) {
   const auto& slices = pipeline.estimate().slices;
-  return static_cast<std::size_t>(std::count_if(slices.begin(), slices.end(),
-                                                [](const SliceEstimate& slice) { return slice.start == "search"; }));
+  return static_cast<std::size_t>(
+      std::count_if(slices.begin(), slices.end(), [](const SliceEstimate& slice) { return slice.start == "search"; }));
 }
 
 TEST(RegistrationEstimator, FindsAHeadThatHasJumpedWhileSlicesArrive) {

@@ -88,10 +88,10 @@ class IncrementalRefinement {
   /// is taken as it is.
   const PoseCandidate& choose(std::size_t position, const std::vector<PoseCandidate>& candidates);
 
-  /// For a slice that choose() has placed and that correlates less than slices usually do: looks for it in the volume of
-  /// the others, alone over turns of up to 45 degrees, and with up to seven slices before it, as of a head at rest, over
-  /// turns of up to 80. It goes where it correlates clearly better, by more the farther that is. If it fits nowhere, it
-  /// is lost: its weight is 0 until refinement brings it back.
+  /// For a slice that choose() has placed and that correlates less than slices usually do: looks for it in the volume
+  /// of the others, alone over turns of up to 45 degrees, and with up to seven slices before it, as of a head at rest,
+  /// over turns of up to 80. It goes where it correlates clearly better, by more the farther that is. If it fits
+  /// nowhere, it is lost: its weight is 0 until refinement brings it back.
   /// @return slices that were moved, the last one at `position`
   std::size_t find_lost(std::size_t position);
 
