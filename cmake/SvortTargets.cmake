@@ -68,7 +68,6 @@ function(svort_cuda_sources name folder)
   if(NOT TARGET torch_cuda)
     message(FATAL_ERROR "SVORT_WITH_CUDA needs a LibTorch that was built with CUDA")
   endif()
-  enable_language(CUDA)
   file(GLOB sources CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/src/${folder}/cuda/*.cpp
        ${PROJECT_SOURCE_DIR}/src/${folder}/cuda/*.cu)
   target_sources(${name} PRIVATE ${sources})
