@@ -25,6 +25,7 @@ constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volu
 constexpr std::size_t kSlicesBetweenMatches = 15;
 constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
 constexpr double kMovingMm = 2.;        // from slice to slice; a head that moves less is at rest
+constexpr int kLongestSearchPause = 4;
 constexpr double kBetterAgreement = 0.003;
 constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
@@ -163,6 +164,7 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   slices[position].start = incremental_->choose(position, candidates).name;
   for (std::size_t moved = incremental_->find_lost(position); moved > 0; --moved)
     slices[position + 1 - moved].start = "search";
+  if (slices[position].start == "search" || incremental_->slices()[position].weight == 0.) search_pause_ = 1;
   incremental_->refine_around(position);
   for (int i = 0; i < options_.incremental.sweeps; ++i) incremental_->sweep();
   take_incremental(sequence, position);
@@ -199,13 +201,16 @@ void RegistrationEstimator::publish_incremental(const SliceSequence& sequence, c
 void RegistrationEstimator::search(const SliceSequence& sequence) {
   if (options_.search_every == 0 || !incremental_->compares()) return;
   if (!search_) search_ = std::make_unique<ScanSearch>();
-  const bool due = sequence.slices().size() >= search_->count() + static_cast<std::size_t>(options_.search_every);
+  const auto waited = [&](int times) {
+    return sequence.slices().size() >= search_->count() + static_cast<std::size_t>(times * options_.search_every);
+  };
   if (search_->started()) {
     // Counted, its answer is waited for; timed, it comes when it comes.
-    if (options_.budget == "time" ? !search_->ready() : !due) return;
-    take_found(sequence);
+    if (options_.budget == "time" ? !search_->ready() : !waited(1)) return;
+    // The next one can wait while there is nothing to be found.
+    search_pause_ = take_found(sequence) ? 1 : std::min(2 * search_pause_, kLongestSearchPause);
   }
-  if (due) start_search(sequence);
+  if (waited(search_pause_)) start_search(sequence);
 }
 
 void RegistrationEstimator::start_search(const SliceSequence& sequence) {
@@ -397,6 +402,7 @@ void RegistrationEstimator::reset() {
   volume_ = Volume();
   incremental_.reset();
   if (search_) search_->give_up();
+  search_pause_ = 1;
   if (source_) source_->reset();
   idle_left_ = 0;
   aligned_ = false;

@@ -95,9 +95,10 @@ struct EstimatorOptions {
   /// "iterations": poses depend on the slices and their order alone, live and in replay. "time": they are improved for
   /// as long as nothing arrives, and depend on the time that leaves.
   std::string budget = "iterations";
-  /// "registration", "incremental": slices between the begin of one search for a head that has jumped and the next,
-  /// from the second stack on; 0: none. With the budget "iterations" what one has found is taken in when the next one
-  /// begins, which waits for it if need be; with "time", as soon as it is there.
+  /// "registration", "incremental": slices from the begin of one search for a head that has jumped to the next one,
+  /// from the second stack on; 0: none. While searches find nothing, the pauses grow to four times that. With the
+  /// budget "iterations" an answer is taken in after so many slices, and waited for if need be; with "time", as soon as
+  /// it is there.
   int search_every = 8;
   std::string templates;  ///< folder of NIfTI brains in canonical orientation; empty: the frame has the scanner's axes
   std::string formulation = "fast";  ///< of the forward model; "exact" to match the public implementation to rounding

@@ -66,6 +66,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   std::unique_ptr<CandidateSource> source_;
   std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
   std::unique_ptr<ScanSearch> search_;
+  int search_pause_ = 1;        ///< EstimatorOptions::search_every times this lie between two searches
   std::size_t idle_left_ = 0;   ///< windows that improve() may still register again before the next slice
   double idle_motion_mm_ = 0.;  ///< largest mean motion of a window in this sweep of improve()
   Estimate estimate_;
