@@ -41,6 +41,8 @@ constexpr double kFits = 0.9;
 // Likewise: a slice with less is lost, and shows nothing to others; one with that is found.
 constexpr double kLostShare = 0.55, kFoundShare = 0.75;
 constexpr double kSearchMargin = 0.02;
+// Slices that lie across the first stack's; before, slices look alike in too many places of its volume.
+constexpr std::size_t kFewestAcross = 6;
 // What a slice must correlate better by to have been lost; far away something always looks like it.
 constexpr double kLostMargin = 0.05, kLostMarginPerMm = 0.005;
 constexpr double kLeastAreaMm2 = 1000.;  // of brain; smaller slices look like others everywhere
@@ -126,7 +128,8 @@ class IncrementalRefinement::Engine {
   std::size_t find_lost(std::size_t position) {
     const double usual = usual_ncc(position);
     const double area_mm2 = static_cast<double>(kept_[position].points[1].value.size()) * pixel_mm_ * pixel_mm_;
-    if (!options_.find_lost || !compares() || area_mm2 < kLeastAreaMm2 || !(slices_[position].ncc < kFits * usual))
+    if (!options_.find_lost || !compares() || beyond_first_stack() < kFewestAcross || area_mm2 < kLeastAreaMm2 ||
+        !(slices_[position].ncc < kFits * usual))
       return 0;
     std::size_t first = position;
     while (first > 0 && position - first + 1 < kRuns.back() && kept_[first - 1].stack == kept_[position].stack) --first;
@@ -271,6 +274,11 @@ class IncrementalRefinement::Engine {
     Pose volume_pose = Pose::Identity();
     double volume_weight = 0.;
   };
+
+  std::size_t beyond_first_stack() const {
+    return static_cast<std::size_t>(
+        std::count_if(kept_.begin(), kept_.end(), [&](const Kept& k) { return k.stack != kept_.front().stack; }));
+  }
 
   /// Median of the others.
   double usual_ncc(std::size_t position) const {

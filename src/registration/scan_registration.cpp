@@ -19,6 +19,10 @@ namespace {
 
 constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
 
+// Of a scan that goes on: slices that lie across the first stack's. The pieces of one stack hardly meet, and agree
+// anywhere.
+constexpr std::ptrdiff_t kFewestAcross = 8;
+
 constexpr int kPieceSlices = 8, kShortPieceSlices = 5;
 constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
 constexpr double kJudgedMm = 2.;
@@ -233,7 +237,9 @@ std::optional<Refinement> search_scan(const RegistrationInput& input, const std:
   if (followed.size() != input.count())
     throw std::invalid_argument("search_scan: " + std::to_string(followed.size()) + " poses for " +
                                 std::to_string(input.count()) + " slices");
-  if (!several_stacks(input)) return std::nullopt;
+  const auto across =
+      std::count_if(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
+  if (across < kFewestAcross) return std::nullopt;
   const auto stopped = [&] { return stop && stop->load(); };
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
   Trials trials(input, options);

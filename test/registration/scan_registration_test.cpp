@@ -169,6 +169,14 @@ TEST(SearchScan, FindsNothingWhereNothingIsLost) {
   EXPECT_FALSE(search_scan(one.input, one.input.T_world_slice, kSizeMm, options).has_value());
 }
 
+TEST(SearchScan, WaitsForSlicesThatLieAcrossTheFirstStack) {
+  SimulatedScan scan = turned_within_stacks(0.9);
+  truncate(&scan, 22 + 7);
+  RefinementOptions options;
+  options.finest_mm = 2.;
+  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, kSizeMm, options).has_value());
+}
+
 TEST(SearchScan, GivesUpWhenItIsTold) {
   const SimulatedScan scan = turned_within_stacks(1.2);
   const std::atomic<bool> stop{true};
