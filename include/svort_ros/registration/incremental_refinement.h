@@ -91,8 +91,7 @@ class IncrementalRefinement {
   /// For a slice that choose() has placed and that correlates less than slices usually do: looks for it in the volume
   /// of the others, alone over turns of up to 45 degrees, and with up to seven slices before it, as of a head at rest,
   /// over turns of up to 80. It goes where it correlates clearly better, by more the farther that is. If it fits
-  /// nowhere, it is lost: its weight is 0 until refinement brings it back.
-  /// Nothing is done while fewer than 6 slices lie across the first stack.
+  /// nowhere, it is lost: its weight is 0 until refinement brings it back. Needs 6 slices across the first stack.
   /// @return slices that were moved, the last one at `position`
   std::size_t find_lost(std::size_t position);
 
