@@ -10,6 +10,7 @@
 #include <iostream>
 #include <iterator>
 #include <stdexcept>
+#include <thread>
 
 #include "bench_support.h"
 #include "svort_ros/decision/decision_engine.h"
@@ -41,6 +42,9 @@ const char* const kLiveBenchUsage =
     "  --threads  default: all cores\n"
     "  --full     run the same with all slices registered again per arrival, up to so many slices; default 90\n"
     "  --volumes  also estimate the volume and decide after each slice, default yes\n"
+    "  --search   also search the scan in the background for a head that has jumped, default yes\n"
+    "  --interval ms from one slice to the next, default 0: as fast as they are answered; the answer of a search that\n"
+    "             is not ready after so many slices is waited for, so that with 0 arrivals take longer than they do live\n"
     "  --seed     of the simulated scan, default 1\n"
     "  --weights  of the live network: lines with its answers as candidates, too, and the slices that it encodes per "
     "arrival\n";
@@ -54,7 +58,8 @@ struct Options {
   std::int64_t stacks = 3;
   std::int64_t threads = at::get_num_threads();
   std::int64_t full = 90;
-  bool volumes = true;
+  bool volumes = true, search = true;
+  std::int64_t interval_ms = 0;
   std::uint64_t seed = 1;
   std::string weights;
 };
@@ -73,6 +78,10 @@ Options parse(const std::vector<std::string>& arguments) {
       options.threads = positive_integers(name, value, 1024).front();
     else if (name == "--full")
       options.full = positive_integers(name, value, 5000).front();
+    else if (name == "--search" && (value == "yes" || value == "no"))
+      options.search = value == "yes";
+    else if (name == "--interval")
+      options.interval_ms = positive_integers(name, value, 60000).front();
     else if (name == "--seed")
       options.seed = static_cast<std::uint64_t>(positive_integers(name, value, 1000000).front());
     else if (name == "--weights")
@@ -155,6 +164,12 @@ struct Baseline {
   std::vector<double> rerun_ms;    ///< registering all slices from the scanner's poses
 };
 
+std::size_t searched_for(const LivePipeline& pipeline) {
+  const auto& slices = pipeline.estimate().slices;
+  return static_cast<std::size_t>(std::count_if(slices.begin(), slices.end(),
+                                                [](const SliceEstimate& slice) { return slice.start == "search"; }));
+}
+
 double rerun_ms(const LivePipeline& pipeline) {
   const RegistrationInput input = registration_input(pipeline.sequence());
   const Clock::time_point start = Clock::now();
@@ -169,6 +184,7 @@ Baseline run(const Options& options, const std::string& update, const std::strin
   pipeline_options.estimator.update = update;
   pipeline_options.estimator.network.candidate = !weights.empty();
   pipeline_options.estimator.network.weights = weights;
+  if (!options.search) pipeline_options.estimator.search_every = 0;
   LivePipeline pipeline(pipeline_options);
   DecisionEngine decisions{DecisionOptions()};
   Slices slices(options);
@@ -176,11 +192,14 @@ Baseline run(const Options& options, const std::string& update, const std::strin
   std::size_t network_starts = 0;
   Baseline measured;
   const bool full = update == "full";
+  Clock::time_point next_arrival = Clock::now();
   const std::int64_t last = full ? std::min(options.full, options.slices.back()) : options.slices.back();
   for (const std::int64_t count : options.slices) {
     if (count > last) break;
     while (static_cast<std::int64_t>(pose_ms.size()) < count) {
       const Slice slice = slices.next().slice;
+      if (!full) std::this_thread::sleep_until(next_arrival);
+      next_arrival = Clock::now() + std::chrono::milliseconds(options.interval_ms);
       const Clock::time_point arrived = Clock::now();
       if (!is_kept(pipeline.add(slice).status)) continue;
       pose_ms.push_back(milliseconds_since(arrived));
@@ -199,7 +218,9 @@ Baseline run(const Options& options, const std::string& update, const std::strin
     const std::size_t at = measured.last_15_ms.size() - 1;
     std::cout << R"({"benchmark": "live", "update": ")" << update << R"(", "network": )"
               << (weights.empty() ? "false" : "true") << R"(, "slices": )" << count << R"(, "stacks_per_scan": )"
-              << options.stacks << R"(, "threads": )" << options.threads << R"(, "pose_ms_median": )"
+              << options.stacks << R"(, "threads": )" << options.threads << R"(, "interval_ms": )"
+              << (full ? 0 : options.interval_ms) << R"(, "search": )" << (options.search && !full ? "true" : "false")
+              << R"(, "searched_for": )" << searched_for(pipeline) << R"(, "pose_ms_median": )"
               << quantile(pose_ms, 0.5) << R"(, "pose_ms_p95": )" << quantile(pose_ms, 0.95) << R"(, "pose_ms_max": )"
               << quantile(pose_ms, 1.) << R"(, "pose_ms_last_15": )" << mean;
     if (options.volumes)

@@ -5,6 +5,7 @@
 #include <array>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 namespace svort {
 namespace {
@@ -31,6 +32,39 @@ Pose fit_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, doub
     }
   }
   return Pose(Eigen::umeyama(a, b, false));
+}
+
+Pose fit_most_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm) {
+  Pose fit = fit_planes(from, to, half_field_mm);
+  const std::size_t half = (from.size() + 1) / 2;
+  /// Planes from the closest to the farthest, and the distance of the one in the middle.
+  const auto ranked = [&](const Pose& motion) {
+    std::vector<std::pair<double, std::size_t>> planes;
+    for (std::size_t i = 0; i < from.size(); ++i)
+      planes.emplace_back(plane_distance(motion * from[i], to[i], half_field_mm), i);
+    std::nth_element(planes.begin(), planes.begin() + static_cast<std::ptrdiff_t>(half - 1), planes.end());
+    return planes;
+  };
+  // Each plane has its say: one of those that agree is close to what they agree on.
+  double best = ranked(fit)[half - 1].first;
+  for (std::size_t i = 0; i < from.size(); ++i) {
+    const Pose own = to[i] * from[i].inverse();
+    const double median = ranked(own)[half - 1].first;
+    if (median >= best) continue;
+    best = median;
+    fit = own;
+  }
+  constexpr int kRounds = 5;
+  for (int round = 0; round < kRounds; ++round) {
+    const auto planes = ranked(fit);
+    std::vector<Pose> close_from, close_to;
+    for (std::size_t k = 0; k < half; ++k) {
+      close_from.push_back(from[planes[k].second]);
+      close_to.push_back(to[planes[k].second]);
+    }
+    fit = fit_planes(close_from, close_to, half_field_mm);
+  }
+  return fit;
 }
 
 double plane_distance(const Pose& a, const Pose& b, double half_field_mm) {

@@ -5,9 +5,12 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <stdexcept>
+#include <string>
 #include <utility>
 
+#include "scan_search.h"
 #include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
@@ -21,6 +24,10 @@ constexpr std::size_t kFewestSlices = 4;        // fewer form no volume to regis
 constexpr std::size_t kFewestForTemplate = 20;  // about one stack: a rough volume
 constexpr std::size_t kSlicesBetweenMatches = 15;
 constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not moved, the next slices will
+constexpr double kMovingMm = 2.;        // from slice to slice; a head that moves less is at rest
+constexpr int kLongestSearchPause = 4;
+constexpr double kBetterAgreement = 0.003;
+constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
 double half_field_mm(const SliceSequence& sequence) {
@@ -41,11 +48,16 @@ RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, st
   if (source_ && options.update != "incremental")
     throw std::invalid_argument("estimator.update is '" + options.update +
                                 "', which knows no candidates; estimator.network.candidate needs incremental");
+  if (options.search_every < 0)
+    throw std::invalid_argument("estimator.search_every is " + std::to_string(options.search_every) +
+                                "; it must be 0 (no search) or more");
   if (options.budget != "iterations" && options.budget != "time")
     throw std::invalid_argument("estimator.budget is '" + options.budget + "'; known: iterations, time");
   formulation_ = acquisition_formulation(options.formulation);
   grid_ = volume_grid(options);
 }
+
+RegistrationEstimator::~RegistrationEstimator() = default;
 
 std::vector<Pose> RegistrationEstimator::crop_poses(const SliceSequence& sequence) const {
   std::vector<Pose> poses;
@@ -86,6 +98,7 @@ void RegistrationEstimator::add(const SliceSequence& sequence) {
   }
   if (options_.update == "incremental") {
     add_incrementally(sequence, position);
+    search(sequence);
   } else if (slices.size() >= kFewestSlices) {
     const std::vector<Pose> start = crop_poses(sequence);
     take(sequence, refine_poses(registration_input(sequence), start, options_.registration, RefinementEffort::warm),
@@ -136,12 +149,22 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   for (const auto& [name, where] : {std::pair{"stack begin", began}, std::pair{"scan begin", slices.begin()}})
     if (where != slices.begin() + static_cast<std::ptrdiff_t>(position))
       candidates.push_back({name, start(where->T_scanner_brain)});
+  // Or it goes on turning as it did between the two slices before.
+  if (position >= 2 && slices[position - 2].info.stack == newest.info.stack) {
+    const Pose& before = slices[position - 1].T_scanner_brain;
+    const Pose on = before * slices[position - 2].T_scanner_brain.inverse() * before;
+    if (plane_distance(start(on), predicted, options_.registration.lever_mm) > kMovingMm)
+      candidates.push_back({"motion goes on", start(on)});
+  }
   if (source_) {
     for (PoseCandidate& candidate : source_->propose(sequence, position, *incremental_))
       candidates.push_back(std::move(candidate));
     estimate_.encoded = source_->take_encoded();
   }
   slices[position].start = incremental_->choose(position, candidates).name;
+  for (std::size_t moved = incremental_->find_lost(position); moved > 0; --moved)
+    slices[position + 1 - moved].start = "search";
+  if (slices[position].start == "search" || incremental_->slices()[position].weight == 0.) search_pause_ = 1;
   incremental_->refine_around(position);
   for (int i = 0; i < options_.incremental.sweeps; ++i) incremental_->sweep();
   take_incremental(sequence, position);
@@ -150,7 +173,6 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
 }
 
 void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std::size_t newest) {
-  const bool registered = estimate_.slices.size() >= kFewestSlices;
   // The slices that were here hold the frame where it was.
   std::vector<Pose> before, after;
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
@@ -158,11 +180,15 @@ void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std:
     before.push_back(estimate_.slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
     after.push_back(incremental_->slices()[i].T_brain_slice);
   }
-  const Pose held = before.empty() ? Pose::Identity() : fit_planes(after, before, half_field_mm(sequence));
+  publish_incremental(sequence, before.empty() ? Pose::Identity() : fit_planes(after, before, half_field_mm(sequence)));
+}
+
+void RegistrationEstimator::publish_incremental(const SliceSequence& sequence, const Pose& T_brain_engine) {
+  const bool registered = estimate_.slices.size() >= kFewestSlices;
   for (std::size_t i = 0; i < estimate_.slices.size(); ++i) {
     SliceEstimate& slice = estimate_.slices[i];
     const RefinedSlice& refined = incremental_->slices()[i];
-    slice.T_brain_slice = held * refined.T_brain_slice * sequence.slices()[i]->T_slice_crop.inverse();
+    slice.T_brain_slice = T_brain_engine * refined.T_brain_slice * sequence.slices()[i]->T_slice_crop.inverse();
     slice.T_scanner_brain = slice.info.T_scanner_slice * slice.T_brain_slice.inverse();
     if (!registered) continue;
     slice.weight = refined.weight;
@@ -170,6 +196,91 @@ void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std:
     slice.status = refined.weight > 0. ? PoseStatus::registered : PoseStatus::outlier;
   }
   take_uncertainty();
+}
+
+void RegistrationEstimator::search(const SliceSequence& sequence) {
+  if (options_.search_every == 0 || !incremental_->compares()) return;
+  if (!search_) search_ = std::make_unique<ScanSearch>();
+  const auto waited = [&](int times) {
+    return sequence.slices().size() >= search_->count() + static_cast<std::size_t>(times * options_.search_every);
+  };
+  if (search_->started()) {
+    // Counted, its answer is waited for; timed, it comes when it comes.
+    if (options_.budget == "time" ? !search_->ready() : !waited(1)) return;
+    // The next one can wait while there is nothing to be found.
+    search_pause_ = take_found(sequence) ? 1 : std::min(2 * search_pause_, kLongestSearchPause);
+  }
+  if (waited(search_pause_)) start_search(sequence);
+}
+
+void RegistrationEstimator::start_search(const SliceSequence& sequence) {
+  std::vector<Pose> followed;
+  for (const RefinedSlice& slice : incremental_->slices()) followed.push_back(slice.T_brain_slice);
+  search_->start(sequence, followed, options_.volume_size_mm, options_.registration, options_.template_match);
+}
+
+bool RegistrationEstimator::take_found(const SliceSequence& sequence) {
+  const std::optional<FoundPoses> found = search_->take();
+  if (!found) return false;
+  const auto& ordered = sequence.slices();
+  const std::vector<RefinedSlice> followed = incremental_->slices();
+  const std::vector<Pose> published = crop_poses(sequence);
+  const Pose T_brain_engine = published.front() * followed.front().T_brain_slice.inverse();
+
+  std::vector<Pose> before, after;
+  std::vector<std::size_t> since;  // arrived since the search began
+  std::size_t next = 0;
+  for (std::size_t i = 0; i < ordered.size(); ++i) {
+    if (next < found->slices.size() && ordered[i] == found->slices[next]) {
+      before.push_back(followed[i].T_brain_slice);
+      after.push_back(found->poses[next++].T_brain_slice);
+    } else {
+      since.push_back(i);
+    }
+  }
+  // Most slices are where they were, up to the frame: they hold it, those that were found elsewhere do not.
+  const Pose held = fit_most_planes(after, before, half_field_mm(sequence));
+  // Those that have arrived since go along with the slice before them, or have been followed better than that.
+  std::vector<RefinedSlice> moved = followed;
+  Pose motion = Pose::Identity();
+  next = 0;
+  for (std::size_t i = 0, k = 0; i < moved.size(); ++i) {
+    if (k < since.size() && since[k] == i) {
+      moved[i].T_brain_slice = motion * moved[i].T_brain_slice;
+      ++k;
+    } else {
+      moved[i] = found->poses[next++];
+      moved[i].T_brain_slice = held * moved[i].T_brain_slice;
+      motion = moved[i].T_brain_slice * followed[i].T_brain_slice.inverse();
+    }
+  }
+  std::vector<RefinedSlice> stayed = moved;
+  for (const std::size_t i : since) stayed[i] = followed[i];
+  // Following has gone on, and may have found by itself what the search did.
+  const RegistrationInput input = registration_input(sequence);
+  const auto agreement = [&](const std::vector<RefinedSlice>& at) {
+    std::vector<Pose> poses;
+    for (const RefinedSlice& slice : at) poses.push_back(slice.T_brain_slice);
+    return coarse_agreement(input, poses);
+  };
+  const double followed_agreement = agreement(followed), moved_agreement = agreement(moved),
+               stayed_agreement = agreement(stayed);
+  if (std::max(moved_agreement, stayed_agreement) < followed_agreement + kBetterAgreement) return false;
+  const std::vector<RefinedSlice>& slices = moved_agreement > stayed_agreement ? moved : stayed;
+  const std::vector<RefinedSlice>& others = moved_agreement > stayed_agreement ? stayed : moved;
+  incremental_->set(slices);
+  for (const std::size_t i : since) {
+    incremental_->choose(i, {{"search", slices[i].T_brain_slice}, {"prediction", others[i].T_brain_slice}});
+    incremental_->find_lost(i);
+    incremental_->refine_around(i);
+  }
+  incremental_->measure_uncertainty();
+  for (std::size_t i = 0; i < slices.size(); ++i)
+    if (plane_distance(incremental_->slices()[i].T_brain_slice, followed[i].T_brain_slice, half_field_mm(sequence)) >
+        kElsewhereMm)
+      estimate_.slices[i].start = "search";
+  publish_incremental(sequence, T_brain_engine);
+  return true;
 }
 
 void RegistrationEstimator::take_uncertainty() {
@@ -193,7 +304,17 @@ void RegistrationEstimator::tell_incremental(const SliceSequence& sequence) {
 }
 
 bool RegistrationEstimator::improve(const SliceSequence& sequence) {
-  if (!incremental_ || options_.budget != "time" || idle_left_ == 0 || estimate_.final) return false;
+  if (!incremental_ || options_.budget != "time" || estimate_.final) return false;
+  if (search_ && search_->ready() && take_found(sequence)) {
+    ++estimate_.revision;
+    idle_left_ = kIdleSweeps * incremental_->windows();
+    idle_motion_mm_ = 0.;
+    return true;
+  }
+  if (idle_left_ == 0) {
+    if (search_ && !search_->started() && sequence.slices().size() > search_->count()) start_search(sequence);
+    return false;
+  }
   const std::size_t windows = incremental_->windows();
   idle_motion_mm_ = std::max(idle_motion_mm_, incremental_->sweep());
   // After a whole sweep that moved nothing there is nothing to gain.
@@ -253,6 +374,7 @@ void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
 }
 
 void RegistrationEstimator::finalise(const SliceSequence& sequence) {
+  if (search_) search_->give_up();
   if (estimate_.slices.size() >= kFewestSlices) {
     const RegistrationInput input = registration_input(sequence);
     const std::vector<Pose> current = crop_poses(sequence);
@@ -279,6 +401,8 @@ void RegistrationEstimator::reset() {
   estimate_.revision = revision;
   volume_ = Volume();
   incremental_.reset();
+  if (search_) search_->give_up();
+  search_pause_ = 1;
   if (source_) source_->reset();
   idle_left_ = 0;
   aligned_ = false;

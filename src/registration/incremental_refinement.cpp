@@ -3,6 +3,7 @@
 #include <torch/types.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <iterator>
 #include <limits>
@@ -12,6 +13,7 @@
 #include <utility>
 
 #include "../acquisition/parallel.h"
+#include "piece_search.h"
 #include "registration_level.h"
 #include "slice_weight.h"
 #include "svort_ros/acquisition/geometry_of_poses.h"
@@ -29,6 +31,21 @@ constexpr double kBlurPixels[kLevels] = {2., 1., 0.5};
 constexpr int kSteps = 3;           // Gauss-Newton steps per pass, as in refine_poses()
 constexpr std::size_t kFewest = 4;  // slices that form a volume
 constexpr double kWeightChange = 0.02;
+
+// Looking for slices that are lost: what they show, blurred with its outline, in the volume of the others.
+constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
+constexpr std::array<std::size_t, 3> kRuns = {1, 4, 8};  // slices that are looked for as one piece
+constexpr double kReachAloneRad = 0.8, kReachRad = 1.4;  // of a slice alone, of a run
+// Of what slices usually correlate: one with so much is where it belongs.
+constexpr double kFits = 0.9;
+// Likewise: a slice with less is lost, and shows nothing to others; one with that is found.
+constexpr double kLostShare = 0.55, kFoundShare = 0.75;
+constexpr double kSearchMargin = 0.02;
+// Slices that lie across the first stack's; before, slices look alike in too many places of its volume.
+constexpr std::size_t kFewestAcross = 6;
+// What a slice must correlate better by to have been lost; far away something always looks like it.
+constexpr double kLostMargin = 0.05, kLostMarginPerMm = 0.005;
+constexpr double kLeastAreaMm2 = 1000.;  // of brain; smaller slices look like others everywhere
 
 }  // namespace
 
@@ -64,6 +81,11 @@ class IncrementalRefinement::Engine {
     kept.mask = sharp.masks;
     for (int level = 0; level < kLevels; ++level)
       kept.points[level] = make_level(one, target_pixel_mm_, kBlurPixels[level] * pixel_mm_).points.front();
+    RegistrationLevel outline = make_level(one, kSearchPixelMm, kSearchBlurMm, SliceContent::outline);
+    kept.outline = outline.slices;
+    kept.outline_mask = outline.masks;
+    kept.outline_points = std::move(outline.points.front());
+    outline_pixel_mm_ = outline.pixel_mm;
     bright_ = bright;
     if (!sums_.defined()) {
       size_ = static_cast<std::int64_t>(std::ceil(volume_size_mm_ / pixel_mm_)) + 6;
@@ -86,30 +108,10 @@ class IncrementalRefinement::Engine {
     if (!compares()) return *best;
     double best_ncc = -std::numeric_limits<double>::infinity();
     RefinedSlice best_state = slices_[position];
-    // Where the head was is where it most likely is: a walk away from there has to be worth it.
-    Vector6d metric;
-    metric << Eigen::Vector3d::Constant(refinement_.lever_mm * refinement_.lever_mm), Eigen::Vector3d::Ones();
-    const double spread = refinement_.step_mm * refinement_.stack_gap_factor;
     for (const PoseCandidate& candidate : candidates) {
       // A coarse start reaches further, but pulls slices towards where the blurred volume looks like them.
       for (const int coarsest : {1, 0}) {
-        RefinedSlice state = slices_[position];
-        state.T_brain_slice = candidate.T_brain_slice;
-        for (int level = coarsest; level <= 1; ++level) {
-          prepare_volume(level);
-          for (int step = 0; step < 2 * kSteps; ++step) {
-            const SliceTerms terms = terms_of(position, state.T_brain_slice, state, level);
-            state.gain = terms.gain;
-            state.offset = terms.offset;
-            const double trust = trust_of(2. * terms.cost);
-            const Vector6d away = twist_of(state.T_brain_slice * candidate.T_brain_slice.inverse());
-            const Matrix6d prior = (metric / (spread * spread)).asDiagonal();
-            const Matrix6d hessian = trust * terms.hessian + prior;
-            const Vector6d gradient = trust * terms.gradient + prior * away;
-            state.T_brain_slice = motion(bounded(-hessian.ldlt().solve(gradient))) * state.T_brain_slice;
-          }
-        }
-        state.ncc = terms_of(position, state.T_brain_slice, state, 1).ncc;
+        const RefinedSlice state = settled(position, candidate.T_brain_slice, coarsest);
         const bool first = &candidate == &candidates.front() && coarsest == 1;
         if (!std::isfinite(state.ncc) || !(first || state.ncc > best_ncc + options_.candidate_margin)) continue;
         best = &candidate;
@@ -121,6 +123,74 @@ class IncrementalRefinement::Engine {
     slices_[position] = best_state;
     weigh(position, position + 1);
     return *best;
+  }
+
+  std::size_t find_lost(std::size_t position) {
+    const double usual = usual_ncc(position);
+    const double area_mm2 = static_cast<double>(kept_[position].points[1].value.size()) * pixel_mm_ * pixel_mm_;
+    if (!options_.find_lost || !compares() || beyond_first_stack() < kFewestAcross || area_mm2 < kLeastAreaMm2 ||
+        !(slices_[position].ncc < kFits * usual))
+      return 0;
+    std::size_t first = position;
+    while (first > 0 && position - first + 1 < kRuns.back() && kept_[first - 1].stack == kept_[position].stack) --first;
+    // What is looked for does not show itself.
+    std::vector<bool> entered;
+    for (std::size_t i = first; i <= position; ++i) {
+      entered.push_back(kept_[i].entered);
+      kept_[i].entered = false;
+    }
+    Eigen::Vector3d centre;
+    const SampledVolume volume = outline_volume(&centre);
+    const double here_ncc = settled(position, slices_[position].T_brain_slice, 1).ncc;
+    double best_ncc = kFoundShare * usual;
+    std::vector<RefinedSlice> found;
+    std::size_t last_length = 0;
+    for (const std::size_t wanted : kRuns) {
+      const std::size_t length = std::min(wanted, position - first + 1);
+      if (length == last_length) break;
+      last_length = length;
+      const std::size_t from = position + 1 - length;
+      Piece piece;
+      piece.bright = bright_;
+      // Lost slices lie anywhere: what is known of a run is that a head mostly rests.
+      const Pose head = slices_[position].T_brain_slice * kept_[position].T_world_slice.inverse();
+      for (std::size_t i = from; i <= position; ++i) {
+        piece.points.push_back(&kept_[i].outline_points);
+        piece.poses.push_back(head * kept_[i].T_world_slice);
+      }
+      const Placing placing =
+          place_piece(piece, volume, centre, {}, length == 1 ? kReachAloneRad : kReachRad, kSearchMargin);
+      for (Pose& pose : piece.poses) pose = placing.best.motion * pose;
+      for (int level = 0; level <= 1; ++level) {
+        prepare_volume(level);
+        for (std::size_t i = from; i <= position; ++i) piece.points[i - from] = &kept_[i].points[level];
+        const Pose together = refine_piece(piece, volumes_[level]);
+        for (Pose& pose : piece.poses) pose = together * pose;
+      }
+      std::vector<RefinedSlice> run;
+      for (std::size_t i = from; i <= position; ++i) run.push_back(settled(i, piece.poses[i - from], 1, 2.));
+      const double away_mm = motion_size(twist_of(run.back().T_brain_slice * slices_[position].T_brain_slice.inverse()),
+                                         refinement_.lever_mm);
+      if (!(run.back().ncc > std::max(best_ncc, here_ncc + kLostMargin + kLostMarginPerMm * away_mm))) continue;
+      best_ncc = run.back().ncc;
+      // Of a run those stay that were in their places.
+      for (std::size_t i = from; i < position; ++i) {
+        const RefinedSlice here = settled(i, slices_[i].T_brain_slice, 1);
+        if (here.ncc + kLostMargin > run[i - from].ncc) run[i - from] = slices_[i];
+      }
+      found = std::move(run);
+    }
+    for (std::size_t i = first; i <= position; ++i) kept_[i].entered = entered[i - first];
+    if (found.empty()) {
+      kept_[position].lost = here_ncc < kLostShare * usual;
+      weigh(position, position + 1);
+      return 0;
+    }
+    from_afar_ = true;
+    std::copy(found.begin(), found.end(), slices_.begin() + static_cast<std::ptrdiff_t>(position + 1 - found.size()));
+    for (std::size_t i = position + 1 - found.size(); i <= position; ++i) kept_[i].lost = false;
+    weigh(position + 1 - found.size(), position + 1);
+    return found.size();
   }
 
   void refine_around(std::size_t position) {
@@ -194,13 +264,82 @@ class IncrementalRefinement::Engine {
     Pose T_world_slice;
     int stack = 0;
     double thickness_mm = 3.;
-    torch::Tensor pixels, mask;   ///< 1 x 1 x s x s
-    SlicePoints points[kLevels];  ///< blurred
-    bool entered = false;         ///< takes part in the volume, if its weight is not 0
-    bool in_volume = false;       ///< its terms are in the sums, at this pose and weight
+    torch::Tensor pixels, mask;           ///< 1 x 1 x s x s
+    SlicePoints points[kLevels];          ///< blurred
+    torch::Tensor outline, outline_mask;  ///< coarse, with the brain's outline, to look for it far away
+    SlicePoints outline_points;
+    bool lost = false;       ///< fits nowhere: shows nothing to the others
+    bool entered = false;    ///< takes part in the volume, if its weight is not 0
+    bool in_volume = false;  ///< its terms are in the sums, at this pose and weight
     Pose volume_pose = Pose::Identity();
     double volume_weight = 0.;
   };
+
+  std::size_t beyond_first_stack() const {
+    return static_cast<std::size_t>(
+        std::count_if(kept_.begin(), kept_.end(), [&](const Kept& k) { return k.stack != kept_.front().stack; }));
+  }
+
+  /// Median of the others.
+  double usual_ncc(std::size_t position) const {
+    std::vector<double> ncc;
+    for (std::size_t i = 0; i < slices_.size(); ++i)
+      if (i != position && kept_[i].entered && slices_[i].weight > 0. && std::isfinite(slices_[i].ncc))
+        ncc.push_back(slices_[i].ncc);
+    if (ncc.empty()) return 0.;
+    const auto middle = ncc.begin() + static_cast<std::ptrdiff_t>(ncc.size() / 2);
+    std::nth_element(ncc.begin(), middle, ncc.end());
+    return *middle;
+  }
+
+  /// A slice registered alone to the volume of the others, from a pose.
+  /// @param freedom factor of how far it may go from there
+  RefinedSlice settled(std::size_t position, const Pose& from, int coarsest, double freedom = 1.) {
+    // Where the head was is where it most likely is: a walk away from there has to be worth it.
+    Vector6d metric;
+    metric << Eigen::Vector3d::Constant(refinement_.lever_mm * refinement_.lever_mm), Eigen::Vector3d::Ones();
+    const double spread = freedom * refinement_.step_mm * refinement_.stack_gap_factor;
+    RefinedSlice state = slices_[position];
+    state.T_brain_slice = from;
+    for (int level = coarsest; level <= 1; ++level) {
+      prepare_volume(level);
+      for (int step = 0; step < 2 * kSteps; ++step) {
+        const SliceTerms terms = terms_of(position, state.T_brain_slice, state, level);
+        state.gain = terms.gain;
+        state.offset = terms.offset;
+        const double trust = trust_of(2. * terms.cost);
+        const Vector6d away = twist_of(state.T_brain_slice * from.inverse());
+        const Matrix6d prior = (metric / (spread * spread)).asDiagonal();
+        const Matrix6d hessian = trust * terms.hessian + prior;
+        const Vector6d gradient = trust * terms.gradient + prior * away;
+        state.T_brain_slice = motion(bounded(-hessian.ldlt().solve(gradient))) * state.T_brain_slice;
+      }
+    }
+    state.ncc = terms_of(position, state.T_brain_slice, state, 1).ncc;
+    return state;
+  }
+
+  /// The volume, blurred, with the brain's outline.
+  SampledVolume outline_volume(Eigen::Vector3d* centre) const {
+    std::vector<torch::Tensor> slices, masks;
+    std::vector<Pose> poses;
+    std::vector<double> thickness_mm, weights;
+    for (std::size_t i = 0; i < kept_.size(); ++i) {
+      if (!kept_[i].entered || !(slices_[i].weight > 0.)) continue;
+      slices.push_back(kept_[i].outline);
+      masks.push_back(kept_[i].outline_mask);
+      poses.push_back(slices_[i].T_brain_slice);
+      thickness_mm.push_back(kept_[i].thickness_mm);
+      weights.push_back(slices_[i].weight);
+    }
+    const auto size = static_cast<std::int64_t>(std::ceil(volume_size_mm_ / outline_pixel_mm_)) + 6;
+    if (poses.empty())
+      return faded_volume({torch::zeros({size, size, size}), torch::zeros({size, size, size})}, outline_pixel_mm_,
+                          centre);
+    const SliceAcquisition acquisition =
+        cube_acquisition(torch::cat(masks), poses, thickness_mm, outline_pixel_mm_, size, outline_pixel_mm_);
+    return faded_volume(weighted_volume(torch::cat(slices), acquisition, weights), outline_pixel_mm_, centre);
+  }
 
   bool one_stack() const {
     return std::all_of(kept_.begin(), kept_.end(), [&](const Kept& k) { return k.stack == kept_.front().stack; });
@@ -255,7 +394,7 @@ class IncrementalRefinement::Engine {
     sums_.zero_();
     in_volume_ = 0;
     for (Kept& kept : kept_) {
-      kept.in_volume = false;
+      kept.in_volume = kept.lost = false;
       kept.entered = true;
     }
     forget_volumes();
@@ -348,6 +487,10 @@ class IncrementalRefinement::Engine {
     }
     return_strays(begin, end);
     evaluate(begin, end, level);
+    if (level == kLevels - 1) {
+      const double enough = kLostShare * usual_ncc(kept_.size());
+      for (std::size_t i = begin; i < end; ++i) kept_[i].lost = kept_[i].lost && !(slices_[i].ncc > enough);
+    }
     weigh(begin, end);
     set_sigma(begin, end);
     if (begin == 0 && end == kept_.size()) hold_frame(before);
@@ -505,7 +648,12 @@ class IncrementalRefinement::Engine {
   }
 
   void weigh(std::size_t begin, std::size_t end) {
-    for (std::size_t i = begin; i < end; ++i) weigh_slice(refinement_.outlier_ncc, &slices_[i]);
+    for (std::size_t i = begin; i < end; ++i) {
+      weigh_slice(refinement_.outlier_ncc, &slices_[i]);
+      if (!kept_[i].lost || !(slices_[i].weight > 0.)) continue;
+      slices_[i].weight = 0.;
+      slices_[i].reason = "lost: it fits neither where the head was nor anywhere else";
+    }
     // All of them outliers: then none is, or there would be no volume to return to.
     if (std::any_of(slices_.begin(), slices_.end(), [](const RefinedSlice& s) { return s.weight > 0.; })) return;
     for (RefinedSlice& slice : slices_)
@@ -523,7 +671,7 @@ class IncrementalRefinement::Engine {
   const RefinementOptions refinement_;
   const IncrementalOptions options_;
   const double resolution_mm_;
-  double target_pixel_mm_ = 2., pixel_mm_ = 2., volume_size_mm_ = 128., bright_ = 1.;
+  double target_pixel_mm_ = 2., pixel_mm_ = 2., outline_pixel_mm_ = 4., volume_size_mm_ = 128., bright_ = 1.;
   std::vector<Kept> kept_;
   std::vector<RefinedSlice> slices_;
   std::vector<SliceTerms> terms_;
@@ -571,6 +719,11 @@ void IncrementalRefinement::insert(std::size_t position, const IncrementalSlice&
 const PoseCandidate& IncrementalRefinement::choose(std::size_t position, const std::vector<PoseCandidate>& candidates) {
   const torch::NoGradGuard no_grad;
   return engine_->choose(position, candidates);
+}
+
+std::size_t IncrementalRefinement::find_lost(std::size_t position) {
+  const torch::NoGradGuard no_grad;
+  return engine_->find_lost(position);
 }
 
 void IncrementalRefinement::refine_around(std::size_t position) {

@@ -1,8 +1,10 @@
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <vector>
 
+#include "piece_search.h"
 #include "registration_level.h"
 #include "sampled_volume.h"
 #include "svort_ros/geometry/pose.h"
@@ -29,8 +31,9 @@ class ScanPieces {
   /// Piece after piece, tries motions of the whole piece: where its neighbours in time are, and turns by up to 80
   /// degrees about the brain's centre; the best are refined, and the one that fits the volume of the others best is
   /// taken. Some sweeps over all pieces.
+  /// @param stop if not null, once it is set no further piece is looked at
   /// @return one pose per slice
-  std::vector<Pose> search(std::vector<Pose> poses) const;
+  std::vector<Pose> search(std::vector<Pose> poses, const std::atomic<bool>* stop = nullptr) const;
 
  private:
   struct Seen {
@@ -42,10 +45,7 @@ class ScanPieces {
   Seen see(std::size_t piece, const std::vector<Pose>& poses) const;
   /// The volume of all pieces but one, and its centre of brightness.
   SampledVolume others(const std::vector<Seen>& seen, std::size_t piece, Eigen::Vector3d* centre) const;
-  Eigen::Vector3d centre_of(std::size_t piece, const std::vector<Pose>& poses) const;
-  double correlation(const std::vector<std::size_t>& slices, const std::vector<Pose>& poses, const Pose& motion,
-                     const SampledVolume& volume, std::size_t stride) const;
-  Pose refined(std::size_t piece, const std::vector<Pose>& poses, Pose motion, const SampledVolume& volume) const;
+  Piece piece_of(const std::vector<std::size_t>& slices, const std::vector<Pose>& poses) const;
   /// How the head had moved at this slice, T_brain_scanner.
   Pose head(std::size_t slice, const std::vector<Pose>& poses) const;
   /// One motion for the whole piece.

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <functional>
 #include <limits>
 #include <map>
 #include <stdexcept>
@@ -17,6 +18,10 @@ namespace svort {
 namespace {
 
 constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
+
+// Of a scan that goes on: slices that lie across the first stack's. The pieces of one stack hardly meet, and agree
+// anywhere.
+constexpr std::ptrdiff_t kFewestAcross = 8;
 
 constexpr int kPieceSlices = 8, kShortPieceSlices = 5;
 constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
@@ -75,6 +80,70 @@ StackAlone stack_alone(const RegistrationInput& input, const std::vector<std::si
   return stack;
 }
 
+bool several_stacks(const RegistrationInput& input) {
+  return std::any_of(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
+}
+
+/// Refinements that are tried one after another. The one whose pieces agree best stays.
+class Trials {
+ public:
+  Trials(const RegistrationInput& input, const RefinementOptions& options)
+      : input_(input),
+        asked_(options),
+        judged_(at_judged_size(options)),
+        judge_(input, kPieceSlices, judged_.finest_mm, judged_.finest_mm) {}
+
+  /// @param trust factor of RefinementOptions::image_trust
+  void attempt(const std::vector<Pose>& start, double trust = 1.) {
+    RefinementOptions with = judged_;
+    with.image_trust = std::min(1., trust * asked_.image_trust);
+    const auto same = [&](const auto& tried) {
+      return tried.second == trust && std::equal(start.begin(), start.end(), tried.first.begin(), tried.first.end(),
+                                                 [](const Pose& a, const Pose& b) { return a.matrix() == b.matrix(); });
+    };
+    if (std::any_of(tried_.begin(), tried_.end(), same)) return;
+    tried_.emplace_back(start, trust);
+    Refinement other = refine_poses(input_, start, with);
+    const double agreement = agreement_of(poses_of(other));
+    // Poses that follow the images more agree a little better by following their noise.
+    const bool bolder = with.image_trust > best_options_.image_trust;
+    if (!best_.slices.empty() && agreement < agreement_ + (bolder ? kBolder : kBetter)) return;
+    best_ = std::move(other);
+    best_options_ = with;
+    agreement_ = agreement;
+  }
+
+  const Refinement& best() const { return best_; }
+  std::vector<Pose> poses() const { return poses_of(best_); }
+  double agreement() const { return agreement_; }
+  double agreement_of(const std::vector<Pose>& poses) const { return judge_.agreement(poses); }
+  /// Of what is tried.
+  const RefinementOptions& options() const { return judged_; }
+
+  /// The best one at the finest level that was asked for.
+  Refinement finest() const {
+    if (asked_.finest_mm >= judged_.finest_mm) return best_;
+    RefinementOptions with = best_options_;
+    with.finest_mm = asked_.finest_mm;
+    return refine_poses(input_, poses_of(best_), with);
+  }
+
+ private:
+  /// What is tried is judged without the finest level, which costs the most and moves slices the least.
+  static RefinementOptions at_judged_size(RefinementOptions options) {
+    options.finest_mm = std::max(kJudgedMm, options.finest_mm);
+    return options;
+  }
+
+  const RegistrationInput& input_;
+  const RefinementOptions asked_, judged_;
+  const ScanPieces judge_;
+  Refinement best_;
+  RefinementOptions best_options_;
+  std::vector<std::pair<std::vector<Pose>, double>> tried_;  ///< starts and trusts, for none to be tried twice
+  double agreement_ = -std::numeric_limits<double>::infinity();
+};
+
 }  // namespace
 
 std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vector<Pose>& start, double size_mm,
@@ -131,9 +200,7 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
                          const RefinementOptions& options, const TemplateOptions& match) {
   if (starts.empty()) throw std::invalid_argument("register_scan: there is no start");
-  const bool several =
-      std::any_of(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
-  if (!several) {
+  if (!several_stacks(input)) {
     // The pieces of one stack hardly meet: what is left is the cost.
     Refinement best = refine_poses(input, starts.front(), options);
     for (std::size_t i = 1; i < starts.size(); ++i) {
@@ -143,50 +210,68 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
     return best;
   }
   validate(input);
-  // What is tried is judged without the finest level, which costs the most and moves slices the least.
-  RefinementOptions calm = options;
-  calm.finest_mm = std::max(kJudgedMm, options.finest_mm);
-  const ScanPieces judge(input, kPieceSlices, calm.finest_mm, calm.finest_mm);
-  Refinement best;
-  RefinementOptions best_options;
-  double agreement = -std::numeric_limits<double>::infinity();
-  const auto attempt = [&](const std::vector<Pose>& start, const RefinementOptions& with) {
-    Refinement other = refine_poses(input, start, with);
-    const double other_agreement = judge.agreement(poses_of(other));
-    // Poses that follow the images more agree a little better by following their noise.
-    const bool bolder = with.image_trust > best_options.image_trust;
-    if (!best.slices.empty() && other_agreement < agreement + (bolder ? kBolder : kBetter)) return;
-    best = std::move(other);
-    best_options = with;
-    agreement = other_agreement;
-  };
-  for (const std::vector<Pose>& start : starts) attempt(start, calm);
-  attempt(assemble_stacks(input, starts.back(), size_mm, calm, match), calm);
-
+  Trials trials(input, options);
+  for (const std::vector<Pose>& start : starts) trials.attempt(start);
+  trials.attempt(assemble_stacks(input, starts.back(), size_mm, trials.options(), match));
   // A head that jumps is restless between its jumps, too: its images count more, its smooth motion less.
-  const auto restless = [&](double factor) {
-    RefinementOptions with = calm;
-    with.image_trust = std::min(1., factor * options.image_trust);
-    return with;
-  };
-  attempt(poses_of(best), restless(4.));
+  trials.attempt(trials.poses(), 4.);
 
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
-  if (pieces.agreement(poses_of(best)) < kAgreed || agreement < kAgreedSharp) {
+  if (pieces.agreement(trials.poses()) < kAgreed || trials.agreement() < kAgreedSharp) {
     const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
-    attempt(pieces.search(poses_of(best)), calm);
-    attempt(pieces.search(starts.back()), calm);
-    attempt(short_pieces.search(poses_of(best)), calm);
-    attempt(poses_of(best), restless(4.));
-    attempt(short_pieces.search(poses_of(best)), restless(4.));
-    attempt(poses_of(best), restless(16.));
-    attempt(poses_of(best), restless(4.));
+    trials.attempt(pieces.search(trials.poses()));
+    trials.attempt(pieces.search(starts.back()));
+    trials.attempt(short_pieces.search(trials.poses()));
+    trials.attempt(trials.poses(), 4.);
+    trials.attempt(short_pieces.search(trials.poses()), 4.);
+    trials.attempt(trials.poses(), 16.);
+    trials.attempt(trials.poses(), 4.);
   }
-  if (options.finest_mm < calm.finest_mm) {
-    best_options.finest_mm = options.finest_mm;
-    best = refine_poses(input, poses_of(best), best_options);
+  return trials.finest();
+}
+
+std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,
+                                      const RefinementOptions& options, const TemplateOptions& match,
+                                      const std::atomic<bool>* stop) {
+  validate(input);
+  if (followed.size() != input.count())
+    throw std::invalid_argument("search_scan: " + std::to_string(followed.size()) + " poses for " +
+                                std::to_string(input.count()) + " slices");
+  const auto across =
+      std::count_if(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
+  if (across < kFewestAcross) return std::nullopt;
+  const auto stopped = [&] { return stop && stop->load(); };
+  const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
+  Trials trials(input, options);
+  const double agreement = trials.agreement_of(followed);
+  const auto agreed = [&](const std::vector<Pose>& poses, double sharp) {
+    return sharp >= kAgreedSharp && pieces.agreement(poses) >= kAgreed;
+  };
+  if (agreed(followed, agreement)) return std::nullopt;
+  const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
+  const std::vector<std::function<void()>> steps = {
+      [&] { trials.attempt(followed); },
+      [&] { trials.attempt(pieces.search(trials.poses(), stop)); },
+      [&] { trials.attempt(assemble_stacks(input, input.T_world_slice, size_mm, trials.options(), match)); },
+      [&] { trials.attempt(pieces.search(trials.poses(), stop)); },
+      [&] { trials.attempt(short_pieces.search(trials.poses(), stop), 4.); },
+      [&] { trials.attempt(trials.poses(), 16.); },
+  };
+  for (const auto& step : steps) {
+    if (stopped()) return std::nullopt;
+    step();
+    if (agreed(trials.poses(), trials.agreement())) break;
   }
-  return best;
+  if (trials.agreement() < agreement + kBolder) return std::nullopt;
+  return trials.best();
+}
+
+double coarse_agreement(const RegistrationInput& input, const std::vector<Pose>& poses) {
+  validate(input);
+  if (poses.size() != input.count())
+    throw std::invalid_argument("coarse_agreement: " + std::to_string(poses.size()) + " poses for " +
+                                std::to_string(input.count()) + " slices");
+  return ScanPieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm).agreement(poses);
 }
 
 }  // namespace svort

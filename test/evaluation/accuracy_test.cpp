@@ -106,6 +106,8 @@ TEST(Accuracy, CausalPosesAreCountedAgainstTheirRadii) {
     EXPECT_NEAR((narrow.*score).ratio_95, 1e6 * (wide.*score).ratio_95, 1.) << "errors do not depend on the factor";
   }
   EXPECT_EQ(wide.network_starts, 0U) << "there is no network";
+  EXPECT_GT(wide.followed_ed_mm, 0.);
+  EXPECT_LT(wide.followed_ed_mm, 5.);
 }
 
 TEST(StackCorrelations, RightPosesPredictTheStackThatIsLeftOut) {

@@ -45,6 +45,23 @@ TEST(FitPlanes, ShiftsThatDisagreeAreAveraged) {
   EXPECT_LT(rotation_angle(fit), 1e-10);
 }
 
+TEST(FitMostPlanes, IsNotMisledByPlanesThatWentElsewhere) {
+  std::mt19937 random(2);
+  std::normal_distribution<double> normal(0., 0.1);
+  const Pose motion = random_pose(random);
+  std::vector<Pose> from, to;
+  for (int i = 0; i < 20; ++i) {
+    from.push_back(random_pose(random));
+    to.push_back(motion * from.back());
+    to.back().translation() += Eigen::Vector3d(normal(random), normal(random), normal(random));
+    if (i % 5 < 2) to.back() = random_pose(random) * to.back();
+  }
+  const auto error_mm = [&](const Pose& fit) { return plane_distance(fit, motion, 50.); };
+  EXPECT_LT(error_mm(fit_most_planes(from, to, 50.)), 0.2);
+  EXPECT_GT(error_mm(fit_planes(from, to, 50.)), 10.) << "which the mean of all is";
+  EXPECT_LT(error_mm(fit_most_planes({from[2]}, {motion * from[2]}, 50.)), 1e-10);
+}
+
 TEST(PlaneDistance, IsTheLargestOfItsPoints) {
   Pose turned = Pose::Identity();
   turned.linear() = Eigen::AngleAxisd(M_PI / 2., Eigen::Vector3d::UnitX()).toRotationMatrix();
@@ -57,6 +74,7 @@ TEST(PlaneDistance, IsTheLargestOfItsPoints) {
 
 TEST(FitPlanes, NamesTheCountsThatDoNotFit) {
   EXPECT_THROW(fit_planes({}, {}, 50.), std::invalid_argument);
+  EXPECT_THROW(fit_most_planes({}, {}, 50.), std::invalid_argument);
   EXPECT_THROW(fit_planes({Pose::Identity()}, {Pose::Identity(), Pose::Identity()}, 50.), std::invalid_argument);
 }
 

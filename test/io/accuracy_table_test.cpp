@@ -62,10 +62,13 @@ TEST_F(AccuracyTable, PoolsTheSlicesWithinTheirRadii) {
   second.radius = {40, 30, 1.6};
   first.radius_one_stack = {20, 19, 0.9};
   second.network_starts = 3;
+  second.search_starts = 5;
+  first.followed_ed_mm = 1.;
+  second.followed_ed_mm = 2.5;
   const auto path = folder_ / "accuracy.csv";
   write_accuracy_rows(path, {first, second});
   const std::string table = accuracy_markdown(read_accuracy_rows(path));
-  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 3 |"), std::string::npos) << table;
+  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 3 | 5 | 1.75 / 1.75 |"), std::string::npos) << table;
   EXPECT_EQ(accuracy_markdown({row("nominal", 1, 1.)}).find("radius"), std::string::npos) << "no radii, no table";
 }
 

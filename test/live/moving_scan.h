@@ -32,8 +32,9 @@ struct MovingScan {
 
 /// @param jump of the head before slice number `jump_at`
 inline MovingScan moving_scan(int stacks = 3, std::size_t jump_at = 0,
-                              const svort::Pose& jump = svort::Pose::Identity()) {
+                              const svort::Pose& jump = svort::Pose::Identity(), int slices_per_stack = 16) {
   SimulatedScanOptions options;
+  options.slices = slices_per_stack;
   options.stacks = stacks;
   options.jump_at = jump_at;
   options.jump = jump;

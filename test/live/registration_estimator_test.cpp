@@ -2,8 +2,11 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <chrono>
 #include <stdexcept>
 #include <string>
+#include <thread>
 
 #include "moving_scan.h"
 #include "registration/registration_fixture.h"
@@ -116,6 +119,98 @@ TEST(RegistrationEstimator, ImprovesWhileNothingArrivesIfTimeIsTheBudget) {
   EXPECT_FALSE(timed.improve()) << "nothing is better than final";
 }
 
+/// Its head turns by 63 degrees within the second stack.
+Scan jumping_scan() {
+  Pose jump = Pose::Identity();
+  jump.linear() = Eigen::AngleAxisd(1.1, Eigen::Vector3d(1., -2., 1.).normalized()).toRotationMatrix();
+  jump.translation() = Eigen::Vector3d(5., -4., 3.);
+  return moving_scan(3, 33, jump, 22);
+}
+
+PipelineOptions without_searches() {
+  PipelineOptions options = quick_options();
+  options.estimator.search_every = 0;
+  options.estimator.incremental.find_lost = false;
+  return options;
+}
+
+/// Of the poses as they were followed, before finalise().
+double followed_error_mm(LivePipeline& pipeline, const Scan& scan) {
+  std::vector<Pose> truth, poses;
+  for (std::size_t i = 0; i < scan.slices.size(); ++i)
+    if (is_kept(pipeline.add(scan.slices[i]).status)) truth.push_back(scan.truth[i]);
+  for (const SliceEstimate& slice : pipeline.estimate().slices) poses.push_back(slice.T_brain_slice);
+  return relative_error_mm(poses, truth);
+}
+
+std::size_t found(const LivePipeline& pipeline) {
+  const auto& slices = pipeline.estimate().slices;
+  return static_cast<std::size_t>(
+      std::count_if(slices.begin(), slices.end(), [](const SliceEstimate& slice) { return slice.start == "search"; }));
+}
+
+TEST(RegistrationEstimator, FindsAHeadThatHasJumpedWhileSlicesArrive) {
+  const Scan scan = jumping_scan();
+  LivePipeline blind(without_searches());
+  const double lost = followed_error_mm(blind, scan);
+  ASSERT_GT(lost, 6.);
+  EXPECT_EQ(found(blind), 0U);
+  LivePipeline nearby(quick_options());  // both kinds of search
+  EXPECT_LT(followed_error_mm(nearby, scan), 0.4 * lost);
+  EXPECT_GT(found(nearby), 0U);
+  // The search in the background alone.
+  PipelineOptions background = without_searches();
+  background.estimator.search_every = quick_options().estimator.search_every;
+  LivePipeline searching(background);
+  EXPECT_LT(followed_error_mm(searching, scan), 0.4 * lost);
+  EXPECT_GT(found(searching), 0U);
+  for (const SliceEstimate& slice : searching.estimate().slices)
+    EXPECT_TRUE((slice.T_scanner_brain * slice.T_brain_slice).isApprox(slice.info.T_scanner_slice, 1e-9));
+  // The same again, to the byte, however long the searches took.
+  LivePipeline again(background);
+  followed_error_mm(again, scan);
+  for (std::size_t i = 0; i < again.estimate().slices.size(); ++i)
+    EXPECT_EQ(again.estimate().slices[i].T_brain_slice.matrix(), searching.estimate().slices[i].T_brain_slice.matrix());
+}
+
+TEST(RegistrationEstimator, TakesInWhatASearchHasFoundWhileNothingArrives) {
+  const Scan scan = jumping_scan();
+  PipelineOptions options = without_searches();
+  options.estimator.budget = "time";
+  options.estimator.search_every = 1000;  // one before the jump; the next one begins when there is nothing else to do
+  LivePipeline pipeline(options);
+  for (const Slice& slice : scan.slices) pipeline.add(slice);
+  EXPECT_EQ(found(pipeline), 0U);
+  using Clock = std::chrono::steady_clock;
+  const auto limit = Clock::now() + std::chrono::minutes(2);
+  while (found(pipeline) == 0 && Clock::now() < limit) {
+    while (pipeline.improve()) {
+    }
+    std::this_thread::sleep_for(std::chrono::milliseconds(20));
+  }
+  EXPECT_GT(found(pipeline), 0U);
+}
+
+TEST(RegistrationEstimator, ASearchThatIsNotWantedAnyMoreIsGivenUp) {
+  const Scan scan = jumping_scan();
+  PipelineOptions options = quick_options();
+  options.estimator.search_every = 4;
+  for (const int end : {0, 1, 2}) {
+    LivePipeline pipeline(options);
+    for (std::size_t i = 0; i < 34; ++i) pipeline.add(scan.slices[i]);
+    if (end == 0) continue;  // the destructor waits for the thread
+    if (end == 1) pipeline.finalise();
+    if (end == 2) pipeline.reset();
+    // And what it would have found is not taken in afterwards.
+    const std::size_t revision_slices = pipeline.estimate().slices.size();
+    EXPECT_EQ(revision_slices > 0, end == 1);
+    Scan next = moving_scan(2);
+    for (Slice& slice : next.slices) slice.info.scan_id = "next";
+    const Poses poses = run(pipeline, next, 0);
+    EXPECT_LT(relative_error_mm(poses.estimated, poses.truth), 1.5);
+  }
+}
+
 TEST(RegistrationEstimator, FindsTheCanonicalFrameWithATemplate) {
   const Scan scan = moving_scan();
   LivePipeline pipeline(quick_options(), {phantom_template()});
@@ -186,6 +281,9 @@ TEST(RegistrationEstimator, NamesTheOptionThatIsOutOfRange) {
   EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
   options = quick_options();
   options.estimator.budget = "money";
+  EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
+  options = quick_options();
+  options.estimator.search_every = -1;
   EXPECT_THROW(LivePipeline pipeline(options), std::invalid_argument);
   options = quick_options();
   options.estimator.template_match.refined = 0;

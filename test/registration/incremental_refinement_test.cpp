@@ -11,6 +11,7 @@
 
 #include "../../src/registration/trajectory.h"
 #include "registration_fixture.h"
+#include "svort_ros/geometry/rigid_fit.h"
 
 namespace svort {
 namespace {
@@ -109,6 +110,77 @@ TEST(IncrementalRefinement, TakesTheCandidateThatFits) {
   refinement.insert(last, slice_of(scan, last), away * right, kBright);
   EXPECT_EQ(refinement.choose(last, {{"prediction", away * right}, {"other", right}}).name, "other");
   EXPECT_LT(motion_size(twist_of(refinement.slices()[last].T_brain_slice * right.inverse()), 40.), 3.);
+}
+
+/// Where slice i is by the truth, in the frame that the slices before it hold.
+Pose true_pose(const IncrementalRefinement& refinement, const SimulatedScan& scan, std::size_t i) {
+  const std::vector<Pose> poses = poses_of(refinement);
+  const std::vector<Pose> truth(scan.truth.begin(), scan.truth.begin() + static_cast<std::ptrdiff_t>(i));
+  return fit_planes(truth, {poses.begin(), poses.begin() + static_cast<std::ptrdiff_t>(i)}, 40.) * scan.truth[i];
+}
+
+double distance_mm(const Pose& a, const Pose& b) { return motion_size(twist_of(a * b.inverse()), 40.); }
+
+TEST(IncrementalRefinement, FindsAHeadThatTurnedFarAway) {
+  SimulatedScanOptions how;
+  how.slices = 22;
+  how.walk_mm = 0.2;
+  how.jump_at = 50;  // in the third stack
+  how.jump.linear() = Eigen::AngleAxisd(0.6, Eigen::Vector3d(1., -1., 2.).normalized()).toRotationMatrix();
+  how.jump.translation() = Eigen::Vector3d(6., -4., 5.);
+  const SimulatedScan scan = simulated_scan(how);
+  IncrementalRefinement refinement(quick_options(), {}, scan.input.resolution_mm, kFieldMm);
+  for (std::size_t i = 0; i < how.jump_at; ++i) {
+    feed(refinement, scan, i);
+    EXPECT_EQ(refinement.find_lost(i), 0U) << "slice " << i << " was not lost";
+  }
+  // The head goes on; the slice that shows it, or one of the next, is found.
+  std::size_t found = 0, at = how.jump_at;
+  for (; found == 0 && at < how.jump_at + 6; ++at) {
+    const Pose predicted = refinement.slices()[at - 1].T_brain_slice * scan.input.T_world_slice[at - 1].inverse() *
+                           scan.input.T_world_slice[at];
+    const Pose truth = true_pose(refinement, scan, at);
+    if (at == how.jump_at) {
+      ASSERT_GT(distance_mm(predicted, truth), 20.);
+    }
+    refinement.insert(at, slice_of(scan, at), predicted, kBright);
+    refinement.choose(at, {{"prediction", predicted}});
+    const double followed = distance_mm(refinement.slices()[at].T_brain_slice, truth);
+    found = refinement.find_lost(at);
+    if (found > 0) {
+      EXPECT_LT(distance_mm(refinement.slices()[at].T_brain_slice, truth), std::min(8., 0.5 * followed));
+    }
+  }
+  EXPECT_GT(found, 0U);
+  // What the option switches off.
+  IncrementalOptions off;
+  off.find_lost = false;
+  IncrementalRefinement blind(quick_options(), off, scan.input.resolution_mm, kFieldMm);
+  for (std::size_t i = 0; i < at; ++i) blind.insert(i, slice_of(scan, i), Pose::Identity(), kBright);
+  blind.set(refinement.slices());
+  EXPECT_EQ(blind.find_lost(at - 1), 0U);
+}
+
+TEST(IncrementalRefinement, ASliceThatFitsNowhereShowsNothingToTheOthers) {
+  SimulatedScanOptions how;
+  how.slices = 22;
+  how.walk_mm = 0.2;
+  const SimulatedScan scan = simulated_scan(how);
+  IncrementalRefinement refinement(quick_options(), {}, scan.input.resolution_mm, kFieldMm);
+  for (std::size_t i = 0; i < 50; ++i) feed(refinement, scan, i);
+  const torch::Tensor before = refinement.volume().clone();
+  // Noise in the shape of the brain.
+  IncrementalSlice noise = slice_of(scan, 50);
+  torch::manual_seed(4);
+  noise.pixels = (torch::rand_like(noise.pixels) * noise.mask).contiguous();
+  const Pose predicted =
+      refinement.slices()[49].T_brain_slice * scan.input.T_world_slice[49].inverse() * scan.input.T_world_slice[50];
+  refinement.insert(50, noise, predicted, kBright);
+  refinement.choose(50, {{"prediction", predicted}});
+  EXPECT_EQ(refinement.find_lost(50), 0U);
+  EXPECT_EQ(refinement.slices()[50].weight, 0.);
+  EXPECT_NE(refinement.slices()[50].reason, "");
+  EXPECT_TRUE(torch::equal(refinement.volume(), before));
 }
 
 TEST(IncrementalRefinement, ReplacesTheTermsOfSlicesThatMoved) {

@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include <atomic>
+#include <cstdint>
 #include <random>
 #include <stdexcept>
 #include <vector>
@@ -14,17 +16,18 @@ namespace {
 
 using svort_test::relative_error_mm;
 using svort_test::simulated_scan;
+using svort_test::SimulatedScan;
 
 constexpr double kSizeMm = 96.;
 
 /// A head that turns by this much, out of registration's reach, before its second stack, and back halfway before its
 /// third.
-svort_test::SimulatedScan turned_between_stacks(double angle) {
+SimulatedScan turned_between_stacks(double angle) {
   svort_test::SimulatedScanOptions options;
   options.slices = 22;  // all of the head
   options.walk_mm = 0.2;
   options.between_mm = 0.;
-  svort_test::SimulatedScan scan = simulated_scan(options);
+  SimulatedScan scan = simulated_scan(options);
   // Turning the head with the scanner at rest is turning the scanner's poses with the head at rest.
   for (std::size_t i = 0; i < scan.input.count(); ++i) {
     const double turn = scan.input.stack[i] == 1 ? angle : scan.input.stack[i] == 2 ? 0.5 * angle : 0.;
@@ -36,6 +39,18 @@ svort_test::SimulatedScan turned_between_stacks(double angle) {
   return scan;
 }
 
+/// Leaves the first `count` slices.
+void truncate(SimulatedScan* scan, std::size_t count) {
+  RegistrationInput& input = scan->input;
+  input.slices = input.slices.narrow(0, 0, static_cast<std::int64_t>(count)).contiguous();
+  input.masks = input.masks.narrow(0, 0, static_cast<std::int64_t>(count)).contiguous();
+  input.T_world_slice.resize(count);
+  input.stack.resize(count);
+  input.time_s.resize(count);
+  input.thickness_mm.resize(count);
+  scan->truth.resize(count);
+}
+
 std::vector<Pose> poses_of(const Refinement& refinement) {
   std::vector<Pose> poses;
   for (const RefinedSlice& slice : refinement.slices) poses.push_back(slice.T_brain_slice);
@@ -43,7 +58,7 @@ std::vector<Pose> poses_of(const Refinement& refinement) {
 }
 
 TEST(AssembleStacks, BringsStacksTogetherHoweverFarTheHeadTurned) {
-  const svort_test::SimulatedScan scan = turned_between_stacks(1.9);
+  const SimulatedScan scan = turned_between_stacks(1.9);
   const std::vector<Pose>& nominal = scan.input.T_world_slice;
   ASSERT_GT(relative_error_mm(nominal, scan.truth), 15.);
   const std::vector<Pose> assembled = assemble_stacks(scan.input, nominal, kSizeMm);
@@ -53,7 +68,7 @@ TEST(AssembleStacks, BringsStacksTogetherHoweverFarTheHeadTurned) {
 }
 
 TEST(RegisterScan, FindsWhatRefinementFromTheStartDoesNot) {
-  const svort_test::SimulatedScan scan = turned_between_stacks(2.8);
+  const SimulatedScan scan = turned_between_stacks(2.8);
   const std::vector<Pose>& nominal = scan.input.T_world_slice;
   RefinementOptions options;
   options.finest_mm = 2.;  // the pixels of this scan
@@ -66,7 +81,7 @@ TEST(RegisterScan, FindsWhatRefinementFromTheStartDoesNot) {
 TEST(RegisterScan, TakesTheBetterStart) {
   svort_test::SimulatedScanOptions options;
   options.slices = 22;
-  const svort_test::SimulatedScan scan = simulated_scan(options);
+  const SimulatedScan scan = simulated_scan(options);
   RefinementOptions refinement;
   refinement.finest_mm = 2.;
   std::vector<Pose> scattered = scan.truth;
@@ -78,12 +93,12 @@ TEST(RegisterScan, TakesTheBetterStart) {
 }
 
 /// Turns the head by `angle` within a stack, once after every eleven slices, each time about another axis.
-svort_test::SimulatedScan turned_within_stacks(double angle) {
+SimulatedScan turned_within_stacks(double angle) {
   svort_test::SimulatedScanOptions options;
   options.slices = 22;
   options.walk_mm = 0.2;
   options.between_mm = 0.;
-  svort_test::SimulatedScan scan = simulated_scan(options);
+  SimulatedScan scan = simulated_scan(options);
   std::mt19937 random(5);
   std::normal_distribution<double> normal(0., 1.);
   Pose head = Pose::Identity();
@@ -99,7 +114,7 @@ svort_test::SimulatedScan turned_within_stacks(double angle) {
 }
 
 TEST(ScanPieces, FindsAHeadThatJumpedWithinItsStacks) {
-  const svort_test::SimulatedScan scan = turned_within_stacks(1.2);
+  const SimulatedScan scan = turned_within_stacks(1.2);
   const std::vector<Pose>& nominal = scan.input.T_world_slice;
   ASSERT_GT(relative_error_mm(nominal, scan.truth), 15.);
   const ScanPieces pieces(scan.input, 8, 4., 6.);
@@ -113,7 +128,7 @@ TEST(ScanPieces, FindsAHeadThatJumpedWithinItsStacks) {
 }
 
 TEST(RegisterScan, FollowsAHeadThatJumpsWithinItsStacks) {
-  const svort_test::SimulatedScan scan = turned_within_stacks(1.2);
+  const SimulatedScan scan = turned_within_stacks(1.2);
   RefinementOptions options;
   options.finest_mm = 2.;
   const std::vector<Pose>& nominal = scan.input.T_world_slice;
@@ -122,10 +137,62 @@ TEST(RegisterScan, FollowsAHeadThatJumpsWithinItsStacks) {
   EXPECT_LT(relative_error_mm(poses_of(register_scan(scan.input, {nominal}, kSizeMm, options)), scan.truth), 1.);
 }
 
+TEST(SearchScan, FindsWhereAFollowedHeadWentWithoutTheRestOfTheScan) {
+  SimulatedScan scan = turned_within_stacks(0.9);
+  truncate(&scan, 2 * 22 + 11);
+  RefinementOptions options;
+  options.finest_mm = 2.;
+  const std::vector<Pose> followed = poses_of(refine_poses(scan.input, scan.input.T_world_slice, options));
+  const double lost = relative_error_mm(followed, scan.truth);
+  ASSERT_GT(lost, 10.);
+  const auto found = search_scan(scan.input, followed, kSizeMm, options);
+  ASSERT_TRUE(found.has_value());
+  EXPECT_LT(relative_error_mm(poses_of(*found), scan.truth), 0.3 * lost);
+  EXPECT_GT(coarse_agreement(scan.input, poses_of(*found)), coarse_agreement(scan.input, followed) + 0.02);
+  // The same again, to the byte.
+  const auto again = search_scan(scan.input, followed, kSizeMm, options);
+  ASSERT_TRUE(again.has_value());
+  for (std::size_t i = 0; i < followed.size(); ++i)
+    EXPECT_TRUE(found->slices[i].T_brain_slice.isApprox(again->slices[i].T_brain_slice, 0.)) << i;
+}
+
+TEST(SearchScan, FindsNothingWhereNothingIsLost) {
+  svort_test::SimulatedScanOptions how;
+  how.slices = 22;
+  const SimulatedScan scan = simulated_scan(how);
+  RefinementOptions options;
+  options.finest_mm = 2.;
+  EXPECT_FALSE(search_scan(scan.input, scan.truth, kSizeMm, options).has_value());
+  // One stack says nothing about jumps.
+  how.stacks = 1;
+  const SimulatedScan one = simulated_scan(how);
+  EXPECT_FALSE(search_scan(one.input, one.input.T_world_slice, kSizeMm, options).has_value());
+}
+
+TEST(SearchScan, WaitsForSlicesThatLieAcrossTheFirstStack) {
+  SimulatedScan scan = turned_within_stacks(0.9);
+  truncate(&scan, 22 + 7);
+  RefinementOptions options;
+  options.finest_mm = 2.;
+  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, kSizeMm, options).has_value());
+}
+
+TEST(SearchScan, GivesUpWhenItIsTold) {
+  const SimulatedScan scan = turned_within_stacks(1.2);
+  const std::atomic<bool> stop{true};
+  RefinementOptions options;
+  options.finest_mm = 2.;
+  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, kSizeMm, options, {}, &stop).has_value());
+  const ScanPieces pieces(scan.input, 8, 4., 6.);
+  const std::vector<Pose> as_given = pieces.search(scan.input.T_world_slice, &stop);
+  for (std::size_t i = 0; i < as_given.size(); ++i)
+    EXPECT_TRUE(as_given[i].isApprox(scan.input.T_world_slice[i], 1e-9)) << i;
+}
+
 TEST(ScanPieces, AgreementTellsTruthFromScatteredAndDisplacedSlices) {
   svort_test::SimulatedScanOptions options;
   options.slices = 22;
-  const svort_test::SimulatedScan scan = simulated_scan(options);
+  const SimulatedScan scan = simulated_scan(options);
   const ScanPieces pieces(scan.input, 8, 2., 2.);
   const double truth = pieces.agreement(scan.truth);
   EXPECT_GT(truth, 0.9);
@@ -149,7 +216,7 @@ TEST(ScanPieces, AgreementTellsTruthFromScatteredAndDisplacedSlices) {
 TEST(ScanPieces, TakesWhatHoldsNoBrain) {
   svort_test::SimulatedScanOptions options;
   options.slices = 12;
-  svort_test::SimulatedScan scan = simulated_scan(options);
+  SimulatedScan scan = simulated_scan(options);
   // The first and a middle slice have no mask, and go along with others.
   for (const std::int64_t i : {0, 17}) scan.input.masks[i].zero_();
   const ScanPieces pieces(scan.input, 8, 4., 6.);
@@ -167,23 +234,18 @@ TEST(ScanPieces, TakesWhatHoldsNoBrain) {
 TEST(AssembleStacks, LeavesOneStackAsItIs) {
   svort_test::SimulatedScanOptions options;
   options.stacks = 1;
-  const svort_test::SimulatedScan scan = simulated_scan(options);
+  const SimulatedScan scan = simulated_scan(options);
   const std::vector<Pose> assembled = assemble_stacks(scan.input, scan.input.T_world_slice, kSizeMm);
   for (std::size_t i = 0; i < assembled.size(); ++i)
     EXPECT_TRUE(assembled[i].isApprox(scan.input.T_world_slice[i], 0.)) << i;
 }
 
 TEST(AssembleStacks, KeepsAStackOfFewSlicesBesideTheOneBeforeIt) {
-  svort_test::SimulatedScan scan = turned_between_stacks(1.9);
+  SimulatedScan scan = turned_between_stacks(1.9);
   // The last stack has only begun.
-  const std::size_t count = 2 * 22 + 5;
-  RegistrationInput begun = scan.input;
-  begun.slices = scan.input.slices.narrow(0, 0, count).contiguous();
-  begun.masks = scan.input.masks.narrow(0, 0, count).contiguous();
-  begun.T_world_slice.resize(count);
-  begun.stack.resize(count);
-  begun.time_s.resize(count);
-  begun.thickness_mm.resize(count);
+  constexpr std::size_t count = 2 * 22 + 5;
+  truncate(&scan, count);
+  const RegistrationInput& begun = scan.input;
   const std::vector<Pose> assembled = assemble_stacks(begun, begun.T_world_slice, kSizeMm);
   // All five go where one rigid motion takes them.
   const Pose motion = assembled[44] * begun.T_world_slice[44].inverse();
@@ -195,9 +257,11 @@ TEST(AssembleStacks, KeepsAStackOfFewSlicesBesideTheOneBeforeIt) {
 TEST(RegisterScan, NamesWhatDoesNotFit) {
   svort_test::SimulatedScanOptions options;
   options.stacks = 1;
-  const svort_test::SimulatedScan scan = simulated_scan(options);
+  const SimulatedScan scan = simulated_scan(options);
   EXPECT_THROW(register_scan(scan.input, {}, kSizeMm), std::invalid_argument);
   EXPECT_THROW(assemble_stacks(scan.input, {Pose::Identity()}, kSizeMm), std::invalid_argument);
+  EXPECT_THROW(search_scan(scan.input, {Pose::Identity()}, kSizeMm), std::invalid_argument);
+  EXPECT_THROW(coarse_agreement(scan.input, {Pose::Identity()}), std::invalid_argument);
 }
 
 }  // namespace

@@ -69,6 +69,9 @@ struct AccuracyRow {
   /// second on.
   RadiusScore radius_one_stack, radius;
   std::size_t network_starts = 0;  ///< live: slices that were registered from where the network had put them
+  std::size_t search_starts = 0;   ///< live: slices that a search found, when the last one had arrived
+  /// Live: relative ED of all slices, first stack included, as they had been followed when the last one had arrived.
+  double followed_ed_mm = std::numeric_limits<double>::quiet_NaN();
 };
 
 /// Everything but the scan.

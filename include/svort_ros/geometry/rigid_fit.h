@@ -13,6 +13,10 @@ namespace svort {
 /// @throws std::invalid_argument if the counts differ or are zero
 Pose fit_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm);
 
+/// The same for planes some of which have gone elsewhere: by the half of them that agree best on one motion.
+/// @throws std::invalid_argument if the counts differ or are zero
+Pose fit_most_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm);
+
 /// How far apart two planes are at the one of those points where they are furthest apart, mm.
 double plane_distance(const Pose& a, const Pose& b, double half_field_mm);
 

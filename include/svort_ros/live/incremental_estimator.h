@@ -38,8 +38,8 @@ struct SliceEstimate {
   double ncc = 0.;
   PoseStatus status = PoseStatus::nominal;
   std::string reason;  ///< why the weight is 0; empty otherwise
-  /// What the slice was first registered from: "prediction", "stack begin", "scan begin", "network" or "network image".
-  /// Empty: it was not.
+  /// What the slice was registered from: "prediction", "stack begin", "scan begin", "motion goes on", "network" or
+  /// "network image"; "search" if it was found elsewhere, at its arrival or since. Empty: it was not.
   std::string start;
   /// 95 % of slices lie closer to their true place than this, relative to the others (root mean square over the head),
   /// mm; see docs/live.md for how it is calibrated. NaN while unknown.
@@ -95,6 +95,11 @@ struct EstimatorOptions {
   /// "iterations": poses depend on the slices and their order alone, live and in replay. "time": they are improved for
   /// as long as nothing arrives, and depend on the time that leaves.
   std::string budget = "iterations";
+  /// "registration", "incremental": slices from the begin of one search for a head that has jumped to the next one,
+  /// from the second stack on; 0: none. While searches find nothing, the pauses grow to four times that. With the
+  /// budget "iterations" an answer is taken in after so many slices, and waited for if need be; with "time", as soon as
+  /// it is there.
+  int search_every = 8;
   std::string templates;  ///< folder of NIfTI brains in canonical orientation; empty: the frame has the scanner's axes
   std::string formulation = "fast";  ///< of the forward model; "exact" to match the public implementation to rounding
   /// SliceEstimate::radius_95_mm over what the registration's equations expect; calibrated, see docs/live.md.
@@ -115,6 +120,7 @@ struct EstimatorOptions {
     v("method", method, "registration (of slices to the volume), network, or nominal (the scanner's poses, no motion)");
     v("update", update, "how registration takes in a slice: incremental, or full (all slices again)");
     v("budget", budget, "iterations: live as in replay; time: improve poses for as long as nothing arrives");
+    v("search_every", search_every, "slices from one search for a head that has jumped to the next; 0: none");
     v("templates", templates, "folder of NIfTI brains in canonical orientation (LPS); empty: scanner's axes");
     v("formulation", formulation, "forward model: fast, or exact (every tap of the slice profile, ten times slower)");
     v("radius_factor", radius_factor, "95 % radius of a pose over its expected error; calibrated");

@@ -11,12 +11,17 @@
 
 namespace svort {
 
+class ScanSearch;
+
 /// Head motion without any trained weights: slices are registered to the volume that they form, the head's motion as
 /// one trajectory in acquisition order (see refine_poses), and the whole to a template, if there is one.
 ///
 /// add() takes the new slice's pose from the head's motion at its neighbour in time and registers it, the newest slices
 /// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() registers all of them
 /// from the scanner's poses, as a batch run does (register_scan). Poses depend on the slices and their order alone.
+///
+/// Following loses a head that jumps far. From the second stack on, search_scan() looks again and again for slices that
+/// lie elsewhere, in a thread of its own (EstimatorOptions::search_every).
 ///
 /// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
 /// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
@@ -28,6 +33,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   /// @throws std::invalid_argument naming the option that is out of range
   RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates,
                         std::unique_ptr<CandidateSource> source = nullptr);
+  ~RegistrationEstimator() override;
 
   void add(const SliceSequence& sequence) override;
   void update_volume(const SliceSequence& sequence) override;
@@ -44,6 +50,10 @@ class RegistrationEstimator : public IncrementalEstimator {
   void take(const SliceSequence& sequence, const Refinement& refinement, const std::vector<Pose>& before);
   void add_incrementally(const SliceSequence& sequence, std::size_t position);
   void take_incremental(const SliceSequence& sequence, std::size_t newest);
+  void publish_incremental(const SliceSequence& sequence, const Pose& T_brain_engine);
+  void search(const SliceSequence& sequence);
+  void start_search(const SliceSequence& sequence);
+  bool take_found(const SliceSequence& sequence);
   void take_uncertainty();
   void tell_incremental(const SliceSequence& sequence);
   void align_to_template(const SliceSequence& sequence, const RegistrationInput& input);
@@ -55,6 +65,8 @@ class RegistrationEstimator : public IncrementalEstimator {
   std::vector<BrainTemplate> templates_;
   std::unique_ptr<CandidateSource> source_;
   std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
+  std::unique_ptr<ScanSearch> search_;
+  int search_pause_ = 1;        ///< EstimatorOptions::search_every times this lie between two searches
   std::size_t idle_left_ = 0;   ///< windows that improve() may still register again before the next slice
   double idle_motion_mm_ = 0.;  ///< largest mean motion of a window in this sweep of improve()
   Estimate estimate_;

@@ -18,6 +18,7 @@ struct IncrementalOptions {
   int passes = 1;                  ///< times that the newest window is registered at each of its three levels of blur
   int sweeps = 1;                  ///< older windows that are registered again per arrival, one after another
   double candidate_margin = 0.02;  ///< a start other than the prediction must correlate better by this
+  bool find_lost = true;           ///< look far away for a slice that does not fit where the head was
   double moved_mm = 0.02;          ///< slices that moved less keep their terms in the volume, mm
 
   template <class Visitor>
@@ -26,6 +27,7 @@ struct IncrementalOptions {
     v("passes", passes, "times that the newest window is registered at each level of blur");
     v("sweeps", sweeps, "older windows that are registered again per arrival");
     v("candidate_margin", candidate_margin, "a start other than the prediction must correlate better by this");
+    v("find_lost", find_lost, "look far away for a slice that does not fit where the head was");
     v("moved_mm", moved_mm, "slices that moved less keep their terms in the volume, mm");
   }
 };
@@ -85,6 +87,13 @@ class IncrementalRefinement {
   /// The first candidate wins unless another one correlates better by candidate_margin. Without a volume the first one
   /// is taken as it is.
   const PoseCandidate& choose(std::size_t position, const std::vector<PoseCandidate>& candidates);
+
+  /// For a slice that choose() has placed and that correlates less than slices usually do: looks for it in the volume
+  /// of the others, alone over turns of up to 45 degrees, and with up to seven slices before it, as of a head at rest,
+  /// over turns of up to 80. It goes where it correlates clearly better, by more the farther that is. If it fits
+  /// nowhere, it is lost: its weight is 0 until refinement brings it back. Needs 6 slices across the first stack.
+  /// @return slices that were moved, the last one at `position`
+  std::size_t find_lost(std::size_t position);
 
   /// Registers the slices around `position` together.
   void refine_around(std::size_t position);

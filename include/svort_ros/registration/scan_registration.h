@@ -1,5 +1,7 @@
 #pragma once
 
+#include <atomic>
+#include <optional>
 #include <vector>
 
 #include "svort_ros/geometry/pose.h"
@@ -35,5 +37,27 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 /// @throws std::invalid_argument naming what does not fit
 Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
                          const RefinementOptions& options = {}, const TemplateOptions& match = {});
+
+/// What register_scan() searches for, for a scan that is still growing and whose poses have been followed: slices that
+/// lie elsewhere because the head has jumped. Without the finest level (2 mm, or RefinementOptions::finest_mm if that
+/// is coarser), and quick if the pieces agree where they are.
+///
+/// @param followed one pose per slice
+/// @param stop     if not null, the search gives up soon after this is set
+/// @return nothing if no poses are clearly better than `followed`, or fewer than 8 slices lie across the first stack
+/// (the pieces
+///         of one stack agree anywhere); else poses in a frame of
+///         their own
+/// @throws std::invalid_argument naming what does not fit
+std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,
+                                      const RefinementOptions& options = {}, const TemplateOptions& match = {},
+                                      const std::atomic<bool>* stop = nullptr);
+
+/// How well a scan's poses agree: its pieces, runs of about 8 slices, each correlated with the volume of all others,
+/// blurred (4 mm pixels).
+/// @param poses one per slice
+/// @return in [-1, 1]; -1 if there are fewer than two pieces with brain in them
+/// @throws std::invalid_argument naming what does not fit
+double coarse_agreement(const RegistrationInput& input, const std::vector<Pose>& poses);
 
 }  // namespace svort
