@@ -44,7 +44,8 @@ const char* const kLiveBenchUsage =
     "  --volumes  also estimate the volume and decide after each slice, default yes\n"
     "  --search   also search the scan in the background for a head that has jumped, default yes\n"
     "  --interval ms from one slice to the next, default 0: as fast as they are answered; the answer of a search that\n"
-    "             is not ready after so many slices is waited for, so that with 0 arrivals take longer than they do live\n"
+    "             is not ready after so many slices is waited for, so that with 0 arrivals take longer than they do "
+    "live\n"
     "  --seed     of the simulated scan, default 1\n"
     "  --weights  of the live network: lines with its answers as candidates, too, and the slices that it encodes per "
     "arrival\n";
@@ -166,8 +167,8 @@ struct Baseline {
 
 std::size_t searched_for(const LivePipeline& pipeline) {
   const auto& slices = pipeline.estimate().slices;
-  return static_cast<std::size_t>(std::count_if(slices.begin(), slices.end(),
-                                                [](const SliceEstimate& slice) { return slice.start == "search"; }));
+  return static_cast<std::size_t>(
+      std::count_if(slices.begin(), slices.end(), [](const SliceEstimate& slice) { return slice.start == "search"; }));
 }
 
 double rerun_ms(const LivePipeline& pipeline) {
