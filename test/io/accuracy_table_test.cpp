@@ -68,7 +68,8 @@ TEST_F(AccuracyTable, PoolsTheSlicesWithinTheirRadii) {
   const auto path = folder_ / "accuracy.csv";
   write_accuracy_rows(path, {first, second});
   const std::string table = accuracy_markdown(read_accuracy_rows(path));
-  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 3 | 5 | 1.75 / 1.75 |"), std::string::npos) << table;
+  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 3 | 5 | 1.75 / 1.75 |"), std::string::npos)
+      << table;
   EXPECT_EQ(accuracy_markdown({row("nominal", 1, 1.)}).find("radius"), std::string::npos) << "no radii, no table";
 }
 
