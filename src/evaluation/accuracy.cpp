@@ -179,15 +179,14 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   row.seconds = (live ? whole : after_arrivals).seconds();
   answer.T_brain_slice = composed(crops, T_crop_slice);
   if (live) {
-    const auto relative_ed_mm = [](const std::vector<Pose>& poses, const std::vector<Pose>& truth) {
-      return summarise(relative_pose_errors(poses_tensor(poses), poses_tensor(truth), kEvaluationFrame).ed).mean;
-    };
     std::vector<Pose> followed;
     for (const SliceEstimate& slice : pipeline.estimate().slices) {
       followed.push_back(slice.T_brain_slice);
       if (slice.start == "search") ++row.search_starts;
     }
-    if (!followed.empty()) row.followed_ed_mm = relative_ed_mm(followed, answer.truth);
+    if (!followed.empty())
+      row.followed_ed_mm =
+          summarise(relative_pose_errors(poses_tensor(followed), poses_tensor(answer.truth), kEvaluationFrame).ed).mean;
     answer.T_brain_slice = published;
     answer.truth = published_truth;
     row.radius_one_stack = radius_ratios.one_stack();

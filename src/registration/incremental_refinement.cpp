@@ -33,9 +33,8 @@ constexpr std::size_t kFewest = 4;  // slices that form a volume
 constexpr double kWeightChange = 0.02;
 
 // Looking for slices that are lost: what they show, blurred with its outline, in the volume of the others.
-constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
 constexpr std::array<std::size_t, 3> kRuns = {1, 4, 8};  // slices that are looked for as one piece
-constexpr double kReachAloneRad = 0.8, kReachRad = 1.4;  // of a slice alone, of a run
+constexpr double kReachAloneRad = 0.8;                   // of a slice alone
 // Of what slices usually correlate: one with so much is where it belongs.
 constexpr double kFits = 0.9;
 // Likewise: a slice with less is lost, and shows nothing to others; one with that is found.
@@ -159,7 +158,7 @@ class IncrementalRefinement::Engine {
         piece.poses.push_back(head * kept_[i].T_world_slice);
       }
       const Placing placing =
-          place_piece(piece, volume, centre, {}, length == 1 ? kReachAloneRad : kReachRad, kSearchMargin);
+          place_piece(piece, volume, centre, {}, length == 1 ? kReachAloneRad : kLargestReachRad, kSearchMargin);
       for (Pose& pose : piece.poses) pose = placing.best.motion * pose;
       for (int level = 0; level <= 1; ++level) {
         prepare_volume(level);

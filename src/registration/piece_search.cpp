@@ -15,8 +15,7 @@ namespace {
 
 constexpr double kVoxelBlur = 1.;  // fills the gaps between the slices of few pieces, voxels
 constexpr double kLeastShare = 0.02;
-constexpr int kRotations = 6300;  // all over SO(3), 13 degrees apart; 800 of them within reach
-constexpr double kLargestReachRad = 1.4;
+constexpr int kRotations = 6300;  // all over SO(3), 13 degrees apart; 800 of them within the largest reach
 constexpr std::size_t kRefined = 6;
 constexpr double kDistinctRad = 0.35;
 constexpr double kLeverMm = 40., kLargestStepMm = 6., kSmallStepMm = 0.2;
@@ -45,7 +44,7 @@ class Correlation {
 
 double angle_of(const Pose& pose) { return Eigen::AngleAxisd(pose.linear()).angle(); }
 
-/// From the smallest turn to the largest.
+/// All turns that may be tried.
 const std::vector<Eigen::Quaterniond>& turns() {
   static const std::vector<Eigen::Quaterniond> turns = [] {
     std::vector<Eigen::Quaterniond> rotations = spread_rotations(kRotations);

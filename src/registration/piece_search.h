@@ -11,6 +11,9 @@
 
 namespace svort {
 
+/// How slices and volumes are seen when they are looked for far away, and how far that is.
+constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6., kLargestReachRad = 1.4;
+
 /// Slices that move together, and where they are.
 struct Piece {
   std::vector<const SlicePoints*> points;
@@ -25,7 +28,7 @@ struct PlacedPiece {
 };
 
 /// Pearson's correlation of all pixels of the piece with the volume; -1 without variation.
-/// @param stride takes every so manieth pixel
+/// @param stride 2 takes every second pixel
 double piece_correlation(const Piece& piece, const Pose& motion, const SampledVolume& volume, std::size_t stride);
 
 /// Centre of brightness, mm.
@@ -35,15 +38,17 @@ Eigen::Vector3d piece_centre(const Piece& piece);
 /// and an offset of its own.
 Pose refine_piece(const Piece& piece, const SampledVolume& volume, Pose start = Pose::Identity());
 
+struct Placing {
+  PlacedPiece here;  ///< where the piece was, refined
+  PlacedPiece best;  ///< may be the same
+};
+
 /// Where the piece fits the volume best: as it is, after one of the motions, or after a turn by up to `reach_rad` (at
-/// most 1.4) about its centre, which then lies in the volume's. The best of them are refined, Gauss-Newton.
+/// most kLargestReachRad) about its centre, which then lies in the volume's. The best of them are refined,
+/// Gauss-Newton.
 ///
 /// @param centre of the volume's brightness, mm
 /// @param margin what it must correlate better by to go elsewhere
-/// @return the first is where it is, refined; the second the best one, which may be the same
-struct Placing {
-  PlacedPiece here, best;
-};
 Placing place_piece(const Piece& piece, const SampledVolume& volume, const Eigen::Vector3d& centre,
                     const std::vector<Pose>& motions, double reach_rad, double margin);
 

@@ -12,7 +12,6 @@ namespace {
 
 constexpr double kVolumeMm = 130.;  // edge: a head at term and some of its motion
 constexpr int kSweeps = 4;
-constexpr double kReachRad = 1.4;
 // A piece goes elsewhere only if it fits better there by this: not for noise.
 constexpr double kMargin = 0.01;
 constexpr double kSliceMargin = 0.02;  // the same for a slice by itself
@@ -110,7 +109,7 @@ void ScanPieces::place(std::size_t piece, std::vector<Seen>* seen, std::vector<P
   if (piece > 0) tried.push_back(head(pieces_[piece - 1].front(), *poses) * here.inverse());
   if (piece + 1 < pieces_.size()) tried.push_back(head(pieces_[piece + 1].front(), *poses) * here.inverse());
   const PlacedPiece best =
-      place_piece(piece_of(pieces_[piece], *poses), volume, centre, tried, kReachRad, kMargin).best;
+      place_piece(piece_of(pieces_[piece], *poses), volume, centre, tried, kLargestReachRad, kMargin).best;
   for (const std::size_t i : pieces_[piece]) (*poses)[i] = best.motion * (*poses)[i];
   (*seen)[piece] = see(piece, *poses);
   (*seen)[piece].correlation = best.correlation;

@@ -24,7 +24,6 @@ constexpr std::size_t kFewestSlices = 8;  // of a stack: fewer form no volume
 constexpr std::ptrdiff_t kFewestAcross = 8;
 
 constexpr int kPieceSlices = 8, kShortPieceSlices = 5;
-constexpr double kSearchPixelMm = 4., kSearchBlurMm = 6.;
 constexpr double kJudgedMm = 2.;
 // Of agreement: what is no better than this is noise.
 constexpr double kBetter = 0.001, kBolder = 0.01;

@@ -45,9 +45,7 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
 /// @param followed one pose per slice
 /// @param stop     if not null, the search gives up soon after this is set
 /// @return nothing if no poses are clearly better than `followed`, or fewer than 8 slices lie across the first stack
-/// (the pieces
-///         of one stack agree anywhere); else poses in a frame of
-///         their own
+///         (the pieces of one stack agree anywhere); else poses in a frame of their own
 /// @throws std::invalid_argument naming what does not fit
 std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,
                                       const RefinementOptions& options = {}, const TemplateOptions& match = {},
