@@ -16,6 +16,7 @@
 #include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
 #include "svort_ros/registration/canonical_frame.h"
+#include "svort_ros/registration/scan_registration.h"
 
 namespace svort {
 namespace {
@@ -50,9 +51,11 @@ Answer nominal_answer(const RegistrationInput& input) {
   return {input.T_world_slice, std::vector<double>(input.count(), 1.), false, {}};
 }
 
-Answer refined_answer(const RegistrationInput& input, const Answer& start, const RefinementOptions& options,
+Answer refined_answer(const RegistrationInput& input, const Answer& start, const EstimatorOptions& options, bool search,
                       bool* converged) {
-  const Refinement refined = refine_poses(input, start.T_brain_crop, options);
+  const Refinement refined = search ? register_scan(input, {start.T_brain_crop}, options.volume_size_mm,
+                                                    options.registration, options.template_match)
+                                    : refine_poses(input, start.T_brain_crop, options.registration);
   Answer answer;
   answer.canonical = start.canonical;
   for (const RefinedSlice& slice : refined.slices) {
@@ -265,7 +268,7 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
   // Poses, and the same after registration.
   const Stopwatch own_time;
   Answer answer = network ? network_answer(part, method, options) : nominal_answer(input);
-  if (registration) answer = refined_answer(input, answer, options.registration, &score.converged);
+  if (registration) answer = refined_answer(input, answer, options, method.search, &score.converged);
   score.seconds = own_time.seconds();
   const ScoredAnswer own = score_answer(answer, part, input, setup);
   score.own = own.score;
@@ -276,7 +279,7 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
     after = own;
   } else if (network && extent.refined) {
     const Stopwatch refined_time;
-    refined = refined_answer(input, answer, options.registration, &score.converged);
+    refined = refined_answer(input, answer, options, false, &score.converged);
     score.refined_seconds = refined_time.seconds();
     after = score_answer(*refined, part, input, setup);
   }
@@ -329,7 +332,8 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
     if (after) slice.refined_relative_ed_mm = after->relative_ed[row].item<double>();
     result.slices.push_back(slice);
   }
-  if (extent.prefixes) result.prefixes = measure_prefixes(score, scan, method, setup);
+  // While slices arrive the live classes search: a row of its own would be the same.
+  if (extent.prefixes && !method.search) result.prefixes = measure_prefixes(score, scan, method, setup);
   return result;
 }
 

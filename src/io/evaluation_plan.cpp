@@ -41,8 +41,8 @@ void check_row(const std::filesystem::path& file, const std::string& where, cons
   if (row.name.find_first_of(",\"\r\n|") != std::string::npos)
     fail(file, where + ".name '" + row.name + "' must have no comma, quote, bar or line break");
   const std::string name = where + " ('" + row.name + "')";
-  if (!holds(std::vector<std::string>{"network", "registration", "nominal"}, row.poses))
-    fail(file, name + ": poses is '" + row.poses + "'; it must be network, registration or nominal");
+  if (!holds(std::vector<std::string>{"network", "registration", "search", "nominal"}, row.poses))
+    fail(file, name + ": poses is '" + row.poses + "'; it must be network, registration, search or nominal");
   if (!holds(std::vector<std::string>{"", "positional_embedding", "volume"}, row.ablation))
     fail(file, name + ": ablation is '" + row.ablation + "'; it must be positional_embedding or volume");
   if (row.iterations < 0 || row.iterations > 100) fail(file, name + ": iterations must be 0 to 100");
@@ -78,6 +78,7 @@ TableRow load_row(const TablePlan& plan, const TableRowPlan& row, const RunnerOp
   result.method.name = row.name;
   if (row.poses != "network") {
     result.method.source = row.poses == "nominal" ? PoseSource::nominal : PoseSource::registration;
+    result.method.search = row.poses == "search";
     return result;
   }
   if (row.weights.empty()) throw std::runtime_error("names no weights");

@@ -44,9 +44,10 @@ bool LivePipeline::improve() {
   return true;
 }
 
-bool LivePipeline::finalise() {
+bool LivePipeline::finalise(const std::atomic<bool>* stop) {
   if (sequence_.slices().empty() || estimate().final) return false;
-  estimator_->finalise(sequence_);
+  estimator_->finalise(sequence_, stop);
+  if (!estimate().final) return false;
   volume_is_stale_ = false;
   return true;
 }

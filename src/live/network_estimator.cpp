@@ -67,9 +67,9 @@ void NetworkEstimator::add(const SliceSequence& sequence) {
   run_network(sequence);
 }
 
-void NetworkEstimator::finalise(const SliceSequence& sequence) {
+void NetworkEstimator::finalise(const SliceSequence& sequence, const std::atomic<bool>* stop) {
   if (!every_arrival_) run_network(sequence);
-  NominalEstimator::finalise(sequence);
+  NominalEstimator::finalise(sequence, stop);
 }
 
 void NetworkEstimator::reset() {

@@ -57,7 +57,7 @@ void NominalEstimator::update_volume(const SliceSequence& sequence) {
   ++estimate_.revision;
 }
 
-void NominalEstimator::finalise(const SliceSequence& sequence) {
+void NominalEstimator::finalise(const SliceSequence& sequence, const std::atomic<bool>* /*stop*/) {
   volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;

@@ -373,7 +373,7 @@ void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
   ++estimate_.revision;
 }
 
-void RegistrationEstimator::finalise(const SliceSequence& sequence) {
+void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::atomic<bool>* stop) {
   if (search_) search_->give_up();
   if (estimate_.slices.size() >= kFewestSlices) {
     const RegistrationInput input = registration_input(sequence);
@@ -381,7 +381,8 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence) {
     // From the scanner's poses, so that the end does not depend on the way; `take` brings it into the frame that is
     // there.
     const Refinement end = register_scan(input, {input.T_world_slice}, options_.volume_size_mm, options_.registration,
-                                         options_.template_match);
+                                         options_.template_match, stop);
+    if (stop && stop->load()) return;
     take(sequence, end, current);
     if (incremental_) {
       tell_incremental(sequence);

@@ -23,10 +23,8 @@ void ScanSearch::start(const SliceSequence& sequence, const std::vector<Pose>& f
   const auto search = [input = registration_input(sequence), followed, size_mm, options, match, stop = stop_,
                        threads = thread_count()] {
     const torch::NoGradGuard no_grad;
-    set_thread_count(1);
-    auto found = search_scan(input, followed, size_mm, options, match, stop.get());
-    set_thread_count(threads);  // the default of threads to come, too
-    return found;
+    const OneCoreScope one_core(threads);
+    return search_scan(input, followed, size_mm, options, match, stop.get());
   };
   answer_ = std::async(std::launch::async, search);
 }

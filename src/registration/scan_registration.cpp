@@ -197,12 +197,14 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 }
 
 Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
-                         const RefinementOptions& options, const TemplateOptions& match) {
+                         const RefinementOptions& options, const TemplateOptions& match,
+                         const std::atomic<bool>* stop) {
+  const auto stopped = [&] { return stop && stop->load(); };
   if (starts.empty()) throw std::invalid_argument("register_scan: there is no start");
   if (!several_stacks(input)) {
     // The pieces of one stack hardly meet: what is left is the cost.
     Refinement best = refine_poses(input, starts.front(), options);
-    for (std::size_t i = 1; i < starts.size(); ++i) {
+    for (std::size_t i = 1; i < starts.size() && !stopped(); ++i) {
       Refinement other = refine_poses(input, starts[i], options);
       if (other.report.last_cost < best.report.last_cost) best = std::move(other);
     }
@@ -210,23 +212,35 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
   }
   validate(input);
   Trials trials(input, options);
-  for (const std::vector<Pose>& start : starts) trials.attempt(start);
-  trials.attempt(assemble_stacks(input, starts.back(), size_mm, trials.options(), match));
-  // A head that jumps is restless between its jumps, too: its images count more, its smooth motion less.
-  trials.attempt(trials.poses(), 4.);
+  const auto take = [&](const std::vector<std::function<void()>>& steps) {
+    for (const auto& step : steps) {
+      if (stopped()) return;
+      step();
+    }
+  };
+  trials.attempt(starts.front());
+  for (std::size_t i = 1; i < starts.size() && !stopped(); ++i) trials.attempt(starts[i]);
+  take({
+      [&] { trials.attempt(assemble_stacks(input, starts.back(), size_mm, trials.options(), match)); },
+      // A head that jumps is restless between its jumps, too: its images count more, its smooth motion less.
+      [&] { trials.attempt(trials.poses(), 4.); },
+  });
+  if (stopped()) return trials.best();
 
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
   if (pieces.agreement(trials.poses()) < kAgreed || trials.agreement() < kAgreedSharp) {
     const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
-    trials.attempt(pieces.search(trials.poses()));
-    trials.attempt(pieces.search(starts.back()));
-    trials.attempt(short_pieces.search(trials.poses()));
-    trials.attempt(trials.poses(), 4.);
-    trials.attempt(short_pieces.search(trials.poses()), 4.);
-    trials.attempt(trials.poses(), 16.);
-    trials.attempt(trials.poses(), 4.);
+    take({
+        [&] { trials.attempt(pieces.search(trials.poses(), stop)); },
+        [&] { trials.attempt(pieces.search(starts.back(), stop)); },
+        [&] { trials.attempt(short_pieces.search(trials.poses(), stop)); },
+        [&] { trials.attempt(trials.poses(), 4.); },
+        [&] { trials.attempt(short_pieces.search(trials.poses(), stop), 4.); },
+        [&] { trials.attempt(trials.poses(), 16.); },
+        [&] { trials.attempt(trials.poses(), 4.); },
+    });
   }
-  return trials.finest();
+  return stopped() ? trials.best() : trials.finest();
 }
 
 std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,

@@ -14,6 +14,16 @@ namespace {
 
 bool same_pose(const svort::Pose& a, const svort::Pose& b) { return a.matrix() == b.matrix(); }
 
+/// What a message says about its volume: of the slices the newest alone.
+svort::Estimate about_volume(const svort::Estimate& estimate, std::uint64_t revision_offset) {
+  svort::Estimate about;
+  about.scan_id = estimate.scan_id;
+  about.revision = estimate.revision + revision_offset;
+  about.final = estimate.final;
+  if (!estimate.slices.empty()) about.slices = {estimate.slices.back()};
+  return about;
+}
+
 }  // namespace
 
 EstimatePublisher::EstimatePublisher(ros::NodeHandle nh, const NodeOptions& options,
@@ -21,7 +31,9 @@ EstimatePublisher::EstimatePublisher(ros::NodeHandle nh, const NodeOptions& opti
     : options_(options),
       estimate_publisher_(nh.advertise<SequenceEstimate>(kEstimateTopic, 10, true)),
       head_pose_publisher_(nh.advertise<geometry_msgs::PoseStamped>(kHeadPoseTopic, 100, true)),
-      volume_publisher_(nh.advertise<Volume>(kVolumeTopic, 2, true)) {
+      volume_publisher_(nh.advertise<Volume>(kVolumeTopic, 2, true)),
+      final_estimate_publisher_(nh.advertise<SequenceEstimate>(kFinalEstimateTopic, 10, true)),
+      final_volume_publisher_(nh.advertise<Volume>(kFinalVolumeTopic, 2, true)) {
   const auto advertise = [&](auto message, Product product, const char* topic) {
     // Not latched by ROS, which would send a state from when somebody last subscribed before the present one.
     const auto connected = [on_connect, product](const ros::SingleSubscriberPublisher&) { on_connect(product); };
@@ -93,16 +105,20 @@ void EstimatePublisher::publish_estimate(const svort::LivePipeline& pipeline, st
 
 void EstimatePublisher::publish_volume(const svort::LivePipeline& pipeline, std::uint64_t revision_offset) {
   if (pipeline.volume().empty()) return;
-  const svort::Estimate& estimate = pipeline.estimate();
-  volume_estimate_ = svort::Estimate();
-  volume_estimate_.scan_id = estimate.scan_id;
-  volume_estimate_.revision = estimate.revision + revision_offset;
-  volume_estimate_.final = estimate.final;
-  if (!estimate.slices.empty()) volume_estimate_.slices = {estimate.slices.back()};
+  volume_estimate_ = about_volume(pipeline.estimate(), revision_offset);
   // Shared, so that nodelets in the same process get it without a copy.
   volume_publisher_.publish(boost::make_shared<const Volume>(
       to_msg(pipeline.volume(), VolumeEncoding::exact, volume_estimate_, options_.brain_frame)));
   for (const Product product : {Product::volume_compact, Product::cloud, Product::surface}) publish(product, pipeline);
+}
+
+void EstimatePublisher::publish_final(const svort::LivePipeline& pipeline, std::uint64_t revision_offset) {
+  SequenceEstimate message = to_msg(pipeline.estimate(), options_.scanner_frame, options_.brain_frame);
+  message.revision += revision_offset;
+  final_estimate_publisher_.publish(message);
+  final_volume_publisher_.publish(boost::make_shared<const Volume>(
+      to_msg(pipeline.volume(), VolumeEncoding::exact, about_volume(pipeline.estimate(), revision_offset),
+             options_.brain_frame)));
 }
 
 std_msgs::Header EstimatePublisher::volume_header() const {

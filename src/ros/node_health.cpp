@@ -80,6 +80,11 @@ void NodeHealth::write_succeeded(std::size_t scans_kept_in_memory) {
   scans_kept_ = scans_kept_in_memory;
 }
 
+void NodeHealth::set_ended_scans(std::size_t being_finalised) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  being_finalised_ = being_finalised;
+}
+
 void NodeHealth::report_slices(diagnostic_updater::DiagnosticStatusWrapper& status) {
   const std::size_t waiting = inbox_length_();
   const std::lock_guard<std::mutex> lock(mutex_);
@@ -148,6 +153,7 @@ void NodeHealth::report_results(diagnostic_updater::DiagnosticStatusWrapper& sta
   status.add("writes", writes_);
   status.add("failed writes", failed_writes_);
   status.add("scans kept in memory", scans_kept_);
+  status.add("ended scans being finalised", being_finalised_);
 }
 
 }  // namespace svort_ros

@@ -42,17 +42,12 @@ std::filesystem::path ScanArchive::save(const svort::LivePipeline& pipeline, con
   return folder_;
 }
 
-void ScanArchive::keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run,
-                       std::unique_ptr<svort::DecisionEngine> decisions) {
-  kept_.push_back({std::move(pipeline), std::move(decisions), std::move(run), std::exchange(folder_, {})});
-}
-
 ScanArchive::Retry ScanArchive::retry() {
   Retry result;
-  std::vector<Kept> left;
-  for (Kept& scan : kept_) {
+  std::vector<ArchivedScan> left;
+  for (ArchivedScan& scan : kept_) {
     try {
-      write(*scan.pipeline, scan.run, scan.decisions.get(), &scan.folder);
+      write(&scan);
       result.written.push_back(scan.folder);
     } catch (const std::exception& error) {
       result.failures.emplace_back(error.what());

@@ -5,6 +5,7 @@
 #include <ros/spinner.h>
 #include <std_srvs/Trigger.h>
 
+#include <atomic>
 #include <chrono>
 #include <cmath>
 #include <exception>
@@ -29,6 +30,7 @@
 #include "svort_ros/ros/parameters.h"
 #include "svort_ros/ros/reconfigure.h"
 #include "svort_ros/ros/scan_archive.h"
+#include "svort_ros/ros/scan_finisher.h"
 
 namespace svort_ros {
 
@@ -75,10 +77,13 @@ class SvortServer::Worker {
         publisher_(nh, options.node, [this](EstimatePublisher::Product product) { subscribed(product); }),
         decision_publisher_(nh, options.node, [this] { subscribed_to_decisions(); }),
         health_(nh, private_nh, options.node, [this] { return inbox_.size(); }),
+        finisher_(archive_, [this](FinishedScan scan) { finished(std::move(scan)); }),
         thread_([this] { run(); }) {}
 
   /// Answers everything that has arrived, and ends the thread.
   void stop() {
+    ending_ = true;
+    hurry_ = true;
     inbox_.close();
     if (thread_.joinable()) thread_.join();
   }
@@ -86,7 +91,11 @@ class SvortServer::Worker {
 
   // Called by ROS threads.
 
-  void receive(const Slice::ConstPtr& message) { inbox_.push({message, Clock::now(), nullptr}); }
+  void receive(const Slice::ConstPtr& message) {
+    ++waiting_;
+    hurry_ = true;
+    inbox_.push({message, Clock::now(), nullptr});
+  }
 
   /// Has the worker execute the command after all that arrived before it, and waits for the answer.
   CommandAnswer call(Command command) {
@@ -131,7 +140,14 @@ class SvortServer::Worker {
                  }});
   }
 
+  /// From the finisher's thread.
+  void finished(FinishedScan scan) {
+    finished_.push(std::move(scan));
+    inbox_.push({nullptr, Clock::now(), [](bool) {}});  // wakes the worker
+  }
+
   void run();
+  void take_finished();
   void answer(const Slice& message, Clock::time_point arrived);
   svort::Arrival take_in(const SliceFromMessage& decoded);
   void end_scan();
@@ -165,6 +181,10 @@ class SvortServer::Worker {
   const ServerOptions options_;
   const std::string topic_;
   Inbox<Item> inbox_;
+  Inbox<FinishedScan> finished_;
+  std::atomic<int> waiting_{0};      ///< slices that are not answered yet
+  std::atomic<bool> ending_{false};  ///< stop() was called
+  std::atomic<bool> hurry_{false};   ///< a slice has come, or the end: what takes long gives up
 
   // The worker's thread alone touches these.
   const std::vector<svort::BrainTemplate> templates_;
@@ -184,6 +204,7 @@ class SvortServer::Worker {
   EstimatePublisher publisher_;
   DecisionPublisher decision_publisher_;
   NodeHealth health_;
+  ScanFinisher finisher_;
   std::thread thread_;  ///< last: it uses all of the above
 };
 
@@ -206,6 +227,7 @@ void SvortServer::Worker::run() {
       else
         item.command(batch.closed);
     }
+    take_finished();
     if (estimate_is_new_) publish_estimate();
     report_estimator();
     if (batch.closed) break;
@@ -214,7 +236,34 @@ void SvortServer::Worker::run() {
     if (awaiting_volume_.size() > 0 && (inbox_.size() == 0 || awaiting_volume_.size() >= limit)) update_volume();
     if (inbox_.size() == 0) improve();
   }
+  finisher_.stop();
+  take_finished();
   save_at_exit();
+}
+
+void SvortServer::Worker::take_finished() {
+  for (FinishedScan& finished : finished_.take_all(false).items) {
+    health_.set_ended_scans(finisher_.count());
+    const std::string name = "scan " + finished.scan.pipeline->sequence().scan_id();
+    if (!finished.failure.empty()) {
+      health_.failed(finished.failure);
+      ROS_ERROR("%s could not be finalised, internal error: %s", name.c_str(), finished.failure.c_str());
+    }
+    const char* how = finished.final ? "is final" : "ends as it was while slices came";
+    if (finished.final)
+      guarded([&] { publisher_.publish_final(*finished.scan.pipeline, finished.scan.revision_offset); });
+    if (finished.written) {
+      health_.write_succeeded(archive_.kept());
+      ROS_INFO("%s %s, and is in %s (%.1f s)", name.c_str(), how, finished.scan.folder.c_str(), finished.seconds);
+    } else if (!finished.not_written.empty()) {
+      archive_.keep(std::move(finished.scan));
+      health_.write_failed(finished.not_written, archive_.kept());
+      ROS_ERROR("%s could not be written and is kept in memory until ~save succeeds: %s", name.c_str(),
+                finished.not_written.c_str());
+    } else {
+      ROS_WARN("%s %s, and is not written: ~node/output_directory is not set", name.c_str(), how);
+    }
+  }
 }
 
 void SvortServer::Worker::answer(const Slice& message, Clock::time_point arrived) {
@@ -261,6 +310,7 @@ void SvortServer::Worker::answer(const Slice& message, Clock::time_point arrived
     status.revision = kept ? entry.revision + revision_offset_ : 0;
     health_.slice_answered(arrival.status, entry.latency_ms);
   });
+  --waiting_;
   if (!worked) status.kept = false;
   status.latency = milliseconds_since(arrived) / 1000.;
   status_publisher_.publish(status);
@@ -288,29 +338,20 @@ svort::Arrival SvortServer::Worker::take_in(const SliceFromMessage& decoded) {
 void SvortServer::Worker::end_scan() {
   const std::string scan_id = pipeline_->sequence().scan_id();
   ROS_INFO("scan %s has ended with %zu slices", scan_id.c_str(), pipeline_->sequence().slices().size());
-  guarded([&] { finalise(); });
-  const svort::DecisionOptions thresholds = decisions_->options();
-  if (archive_.enabled()) {
-    try {
-      const auto folder = archive_.save(*pipeline_, run_info(), decisions_.get());
-      health_.write_succeeded(archive_.kept());
-      ROS_INFO("scan %s is in %s", scan_id.c_str(), folder.c_str());
-    } catch (const std::exception& error) {
-      const svort::RunInfo run = run_info();
-      revision_offset_ += pipeline_->estimate().revision;
-      archive_.keep(std::move(pipeline_), run, std::move(decisions_));
-      pipeline_ = std::make_unique<svort::LivePipeline>(options_.pipeline, templates_);
-      health_.write_failed(error.what(), archive_.kept());
-      ROS_ERROR("scan %s could not be written and is kept in memory until ~save succeeds: %s", scan_id.c_str(),
-                error.what());
-    }
-  } else {
-    ROS_WARN("scan %s is not written: ~node/output_directory is not set", scan_id.c_str());
-  }
+  auto next = std::make_unique<svort::LivePipeline>(options_.pipeline, templates_);
+  auto next_decisions = std::make_unique<svort::DecisionEngine>(decisions_->options());
+  if (awaiting_volume_.size() > 0) update_volume();  // its last slices
+  ArchivedScan ended;
+  ended.run = run_info();
+  ended.folder = archive_.begin_scan();
+  ended.revision_offset = revision_offset_;
+  revision_offset_ += pipeline_->estimate().revision;
+  ended.pipeline = std::exchange(pipeline_, std::move(next));
+  ended.decisions = std::exchange(decisions_, std::move(next_decisions));
+  finisher_.take(std::move(ended));
+  health_.set_ended_scans(finisher_.count());
   ended_scans_.insert(scan_id);
-  archive_.begin_scan();
   publisher_.begin_scan();
-  decisions_ = std::make_unique<svort::DecisionEngine>(thresholds);
   progress_.clear();
   awaiting_volume_.clear();
   has_unsaved_ = false;
@@ -327,7 +368,7 @@ void SvortServer::Worker::update_volume() {
 void SvortServer::Worker::improve() {
   bool improved = false;
   guarded([&] {
-    while (inbox_.size() == 0 && pipeline_->improve()) improved = true;
+    while (inbox_.size() == 0 && !inbox_.closed() && pipeline_->improve()) improved = true;
   });
   if (!improved) return;
   guarded([&] { publisher_.publish_transforms(*pipeline_); });
@@ -399,17 +440,23 @@ CommandAnswer SvortServer::Worker::finalise() {
   const auto started = Clock::now();
   const std::size_t slices = pipeline_->sequence().slices().size();
   if (slices == 0) return {false, "there is no slice yet"};
-  const bool changed = pipeline_->finalise();
+  hurry_ = false;
+  if (waiting_ > 0 || ending_) hurry_ = true;  // in this order: receive() raises them in the other
+  const bool changed = pipeline_->finalise(&hurry_);
+  const bool final = pipeline_->estimate().final;
   if (changed) {
     publisher_.publish_transforms(*pipeline_);
     publish_volume();
+    publisher_.publish_final(*pipeline_, revision_offset_);
   }
+  const std::string after = ", after " + std::to_string(std::lround(milliseconds_since(started))) + " ms";
   const std::string text =
       "scan " + pipeline_->sequence().scan_id() + " with " + std::to_string(slices) + " slices " +
-      (changed ? "is final, after " + std::to_string(std::lround(milliseconds_since(started))) + " ms"
-               : std::string("was final already"));
+      (changed ? "is final" + after
+       : final ? std::string("was final already")
+               : "is not final: given up" + after + ", because " + (ending_ ? "the node ends" : "a slice came"));
   ROS_INFO("%s", text.c_str());
-  return {true, text};
+  return {final, text};
 }
 
 CommandAnswer SvortServer::Worker::reset() {
@@ -445,6 +492,9 @@ CommandAnswer SvortServer::Worker::save() {
   }
   for (const std::string& failure : retried.failures) fail(failure);
 
+  if (const std::size_t ended = finisher_.count(); ended > 0)
+    add(std::to_string(ended) + (ended == 1 ? " ended scan is" : " ended scans are") +
+        " being finalised and will be written then");
   const std::size_t slices = pipeline_->sequence().slices().size();
   if (slices > 0) {
     try {

@@ -144,6 +144,21 @@ TEST(MethodTable, RegistrationAloneAndAfterANetworkFindsWhatTheScannerDoesNotKno
   EXPECT_EQ(kept.weighted.psnr_db, kept.unweighted.psnr_db) << "the oracle's weights are all 1";
 }
 
+TEST(MethodTable, ASearchFindsWhatRefinementDoesNot) {
+  EvaluationScanOptions options;
+  options.motion = "severe";
+  const EvaluationScan scan = simulate_evaluation_scan(small_brain(), options);
+  TableMethod method;
+  method.name = "SVR";
+  method.source = PoseSource::registration;
+  const TableExtent poses_only = {true, false, false};
+  const TableScore alone = measure_method(scan, method, quick_setup(), poses_only).score;
+  method.search = true;
+  const TableResult searched = measure_method(scan, method, quick_setup(), {true, false, true});
+  EXPECT_LT(searched.score.own.relative_ed_mm, 0.8 * alone.own.relative_ed_mm);
+  EXPECT_TRUE(searched.prefixes.empty());
+}
+
 TEST(MethodTable, RejectsWhatItCannotMeasure) {
   const EvaluationScan scan = moving_scan();
   TableMethod method;

@@ -46,7 +46,7 @@ TEST_F(EvaluationTable, TheShippedTableHasThePapersRows) {
   std::vector<std::string> names;
   for (const TableRowPlan& row : shipped.rows) names.push_back(row.name);
   EXPECT_EQ(names, (std::vector<std::string>{"SVoRT (live)", "SVRnet", "PlaneInVol", "without PE", "without Vol",
-                                             "K = 1", "K = 2", "SVR only", "nominal"}));
+                                             "K = 1", "K = 2", "SVR only", "SVR with searches", "nominal"}));
   EXPECT_EQ(shipped.seeds.size(), 4U);
   EXPECT_EQ(shipped.volumes.size(), 4U);
   EXPECT_EQ(shipped.rows[5].iterations, 1);
@@ -84,9 +84,14 @@ TEST_F(EvaluationTable, RowsThatCannotBeMeasuredAreRefusedByName) {
                            "  - {name: other network, weights: " + usual + ", network: svrnet}\n" +              //
                            "  - {name: not ablated, weights: " + usual + ", ablation: volume}\n" +               //
                            "  - {name: secretly ablated, weights: " + blind + "}\n" +                            //
-                           "  - {name: nominal, poses: nominal}\n"),
+                           "  - {name: nominal, poses: nominal}\n" +                                             //
+                           "  - {name: SVR, poses: registration}\n  - {name: searches, poses: search}\n"),
                       {"cpu"});
-  ASSERT_EQ(rows.rows.size(), 3U);
+  ASSERT_EQ(rows.rows.size(), 5U);
+  EXPECT_EQ(rows.rows[3].method.source, PoseSource::registration);
+  EXPECT_FALSE(rows.rows[3].method.search);
+  EXPECT_EQ(rows.rows[4].method.source, PoseSource::registration);
+  EXPECT_TRUE(rows.rows[4].method.search);
   EXPECT_EQ(rows.rows[0].method.name, "good");
   EXPECT_EQ(rows.rows[0].method.iterations, 2);
   EXPECT_EQ(rows.rows[0].method.weights_sha256.size(), 64U);

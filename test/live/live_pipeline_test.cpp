@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <random>
 
@@ -101,6 +102,50 @@ TEST(LivePipeline, FinalStateDoesNotDependOnWhenVolumesWereUpdated) {
     EXPECT_EQ(every.estimate().slices[i].T_brain_slice.matrix(), never.estimate().slices[i].T_brain_slice.matrix());
     EXPECT_EQ(every.estimate().slices[i].ncc, never.estimate().slices[i].ncc);
   }
+}
+
+TEST(LivePipeline, FinalisingCanBeGivenUpAndTakenUpAgain) {
+  PipelineOptions options = small_options();
+  options.estimator.method = "registration";
+  options.estimator.registration.finest_mm = 3.;
+  LivePipeline stopped(options), straight(options);
+  for (const Slice& slice : synthetic_scan()) {
+    stopped.add(slice);
+    straight.add(slice);
+  }
+  const Estimate before = stopped.estimate();
+  const std::atomic<bool> stop{true};
+  EXPECT_FALSE(stopped.finalise(&stop));
+  EXPECT_FALSE(stopped.estimate().final);
+  EXPECT_EQ(stopped.estimate().revision, before.revision);
+  for (std::size_t i = 0; i < before.slices.size(); ++i)
+    EXPECT_EQ(stopped.estimate().slices[i].T_brain_slice.matrix(), before.slices[i].T_brain_slice.matrix());
+
+  EXPECT_TRUE(stopped.finalise());
+  EXPECT_TRUE(straight.finalise());
+  EXPECT_TRUE(stopped.estimate().final);
+  EXPECT_EQ(stopped.volume().values, straight.volume().values);
+}
+
+TEST(LivePipeline, AScanIsTheSameFinalisedOnOneCore) {
+  PipelineOptions options = small_options();
+  options.estimator.method = "registration";
+  options.estimator.registration.finest_mm = 3.;
+  set_thread_count(2);
+  LivePipeline one(options), two(options);
+  for (const Slice& slice : synthetic_scan()) {
+    one.add(slice);
+    two.add(slice);
+  }
+  {
+    const OneCoreScope one_core(2);
+    one.finalise();
+  }
+  EXPECT_EQ(thread_count(), 2);
+  two.finalise();
+  EXPECT_EQ(one.volume().values, two.volume().values);
+  for (std::size_t i = 0; i < one.estimate().slices.size(); ++i)
+    EXPECT_EQ(one.estimate().slices[i].T_brain_slice.matrix(), two.estimate().slices[i].T_brain_slice.matrix());
 }
 
 TEST(LivePipeline, SlicesInAnyOrderAreKeptInAcquisitionOrder) {

@@ -82,7 +82,7 @@ TEST_P(EchoEstimator, AnswersComeBackToTheSlicesTheyBelongTo) {
   SliceSequence sequence;
   feed(estimator, sequence);
   for (const SliceEstimate& slice : estimator.estimate().slices) EXPECT_EQ(slice.status, PoseStatus::nominal);
-  estimator.finalise(sequence);
+  estimator.finalise(sequence, nullptr);
   const auto& estimates = estimator.estimate().slices;
   ASSERT_EQ(estimates.size(), slices.size());
   EXPECT_EQ(estimator.estimate().encoded, slices.size());
@@ -103,7 +103,7 @@ TEST_P(EchoEstimator, TheVolumeFollowsThePoses) {
   NetworkEstimator estimator(small_options(), network(), {});
   SliceSequence sequence;
   feed(estimator, sequence);
-  estimator.finalise(sequence);
+  estimator.finalise(sequence, nullptr);
   // A rigid move of all slices moves the brain out of the grid's centre but not out of itself.
   if (GetParam()) {
     for (const SliceEstimate& slice : estimator.estimate().slices) EXPECT_GT(slice.ncc, 0.9);
@@ -119,14 +119,14 @@ TEST_P(EchoEstimator, TheNetworkHasAForwardModelOfItsOwn) {
     NetworkEstimator estimator(options, network(), {});
     SliceSequence sequence;
     feed(estimator, sequence);
-    estimator.finalise(sequence);
+    estimator.finalise(sequence, nullptr);
     EXPECT_EQ(echo->formulation, AcquisitionFormulation::exact) << "as the networks were trained";
   }
   options.network.formulation = "fast";
   NetworkEstimator estimator(options, network(), {});
   SliceSequence sequence;
   feed(estimator, sequence);
-  estimator.finalise(sequence);
+  estimator.finalise(sequence, nullptr);
   EXPECT_EQ(echo->formulation, AcquisitionFormulation::fast);
 }
 
@@ -151,7 +151,7 @@ TEST_P(EchoEstimator, ASliceAfterTheEndMakesAllPosesNominalAgain) {
   const Slice last = slices.back();
   slices.pop_back();
   feed(estimator, sequence);
-  estimator.finalise(sequence);
+  estimator.finalise(sequence, nullptr);
   const auto frames = estimator.estimate().frame_revision;
   ASSERT_TRUE(is_kept(sequence.add(last).status));
   estimator.add(sequence);

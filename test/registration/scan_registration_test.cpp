@@ -76,6 +76,12 @@ TEST(RegisterScan, FindsWhatRefinementFromTheStartDoesNot) {
   ASSERT_GT(relative_error_mm(poses_of(refined), scan.truth), 5.);
   const Refinement registered = register_scan(scan.input, {nominal}, kSizeMm, options);
   EXPECT_LT(relative_error_mm(poses_of(registered), scan.truth), 1.);
+
+  const std::atomic<bool> stop{true};
+  const Refinement stopped = register_scan(scan.input, {nominal}, kSizeMm, options, {}, &stop);
+  for (std::size_t i = 0; i < refined.slices.size(); ++i)
+    EXPECT_TRUE(stopped.slices[i].T_brain_slice.isApprox(refined.slices[i].T_brain_slice, 0.))
+        << "no step but the first";
 }
 
 TEST(RegisterScan, TakesTheBetterStart) {

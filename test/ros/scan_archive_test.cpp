@@ -4,35 +4,13 @@
 
 #include <fstream>
 
-#include "ros/synthetic_scan.h"
+#include "ros/small_pipeline.h"
 
 namespace svort_ros {
 namespace {
 
 namespace fs = std::filesystem;
-
-svort::PipelineOptions small_options() {
-  svort::PipelineOptions options;
-  options.estimator.method = "nominal";
-  options.sequence.size_px = 32;
-  options.sequence.resolution_mm = 3.;
-  options.estimator.volume_resolution_mm = 4.;
-  options.estimator.volume_size_mm = 96.;
-  return options;
-}
-
-std::unique_ptr<svort::LivePipeline> pipeline_with(const std::string& scan_id, std::size_t slices = 3) {
-  auto pipeline = std::make_unique<svort::LivePipeline>(small_options());
-  svort_test::SyntheticScanOptions scan;
-  scan.scan_id = scan_id;
-  scan.pixels = 24;
-  scan.pixel_mm = 4.;
-  for (const svort::Slice& slice : svort_test::synthetic_scan(scan)) {
-    if (pipeline->sequence().slices().size() == slices) break;
-    pipeline->add(slice);
-  }
-  return pipeline;
-}
+using svort_test::pipeline_with;
 
 TEST(FolderName, IsSafe) {
   EXPECT_EQ(folder_name("sub-01_run.2"), "sub-01_run.2");
@@ -54,7 +32,7 @@ TEST(ScanArchive, SavingAgainReplacesItsOwnFolderOnly) {
   EXPECT_EQ(archive.save(*pipeline, {}), folder.path() / "head_2");
   EXPECT_TRUE(fs::exists(folder.path() / "head_2" / "run.json"));
   EXPECT_EQ(svort_test::read_bytes(folder.path() / "head" / "poses.csv"), "old");
-  archive.begin_scan();
+  EXPECT_EQ(archive.begin_scan(), folder.path() / "head_2");
   EXPECT_EQ(archive.save(*pipeline, {}), folder.path() / "head_3");
 }
 
@@ -76,8 +54,8 @@ TEST(ScanArchive, KeepsWhatCouldNotBeWrittenAndWritesItLater) {
   ScanArchive archive(root);
   auto first = pipeline_with("first");
   EXPECT_THROW(archive.save(*first, {}), std::runtime_error);
-  archive.keep(std::move(first), {});
-  archive.keep(pipeline_with("second"), {});
+  archive.keep({std::move(first), nullptr, {}, archive.begin_scan()});
+  archive.keep({pipeline_with("second"), nullptr, {}, {}});
   EXPECT_EQ(archive.kept(), 2U);
 
   ScanArchive::Retry retry = archive.retry();

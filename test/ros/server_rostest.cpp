@@ -94,6 +94,23 @@ TEST_F(ServerTest, WritesAScanThatWasNotSavedWhenItEnds) {
   EXPECT_EQ(svort::read_pose_table(folder_.path() / "unsaved" / "poses.csv").size(), 4U);
 }
 
+TEST_F(ServerTest, WritesScansThatHaveEndedThoughTheyAreNotFinalYet) {
+  // Registered as a whole they take longer than their slices: some wait when the server ends.
+  ros::param::set("svort/estimator/final_volume/resolution_mm", 1.);
+  auto server = make_server();
+  const std::vector<std::string> scans = {"first", "second", "third"};
+  {
+    svort_test::NodeClient client;
+    ASSERT_TRUE(client.connect());
+    for (const std::string& scan : scans)
+      for (const SliceStatus& status : client.send_and_wait(synthetic_messages(scan)))
+        EXPECT_TRUE(status.kept) << status.reason;
+  }
+  server.reset();
+  for (const std::string& scan : scans)
+    EXPECT_EQ(svort::read_pose_table(folder_.path() / scan / "poses.csv").size(), 24U) << scan;
+}
+
 TEST_F(ServerTest, StartsAndEndsManyTimesWithSlicesComingIn) {
   svort_test::NodeClient client;
   const auto slices = synthetic_messages("again");

@@ -17,6 +17,7 @@ namespace svort {
 struct TableMethod {
   std::string name;
   PoseSource source = PoseSource::network;  ///< nominal, registration or network
+  bool search = false;                      ///< source registration: register_scan(), not refine_poses() alone
   std::shared_ptr<NetworkRunner> network;   ///< of source network
   int iterations = 0;                       ///< K of the network; 0: as many as it was made for
   std::string weights_sha256;               ///< of the network's parameters; empty: none
@@ -100,7 +101,8 @@ TableKey table_key(const TableMethod& method, const std::string& brain, const Ev
 /// Runs one method on one scan.
 ///
 /// The network sees what the live system would give it at the end of the scan (or of a part of it). Registration starts
-/// from the method's poses; its row of its own starts from the scanner's. Templates: AccuracySetup::atlas.
+/// (refine_poses()) from the method's poses; its rows of its own start from the scanner's. Templates:
+/// AccuracySetup::atlas.
 /// @throws std::invalid_argument naming the option that does not fit
 TableResult measure_method(const EvaluationScan& scan, const TableMethod& method, const AccuracySetup& setup,
                            const TableExtent& extent = {});

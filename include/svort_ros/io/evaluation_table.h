@@ -13,10 +13,12 @@ namespace svort {
 
 /// One row of a table of methods, as its file describes it.
 struct TableRowPlan {
-  std::string name;               ///< in the table; no comma, quote or line break
-  std::string poses = "network";  ///< network, registration (from the scanner's poses) or nominal (the scanner's poses)
-  std::string weights;            ///< of a network: its file
-  std::string network;            ///< if not empty, the network that the file must hold
+  std::string name;  ///< in the table; no comma, quote or line break
+  /// network; registration (refinement from the scanner's poses); search (registration of the whole scan, with what is
+  /// searched for at its end); or nominal (the scanner's poses)
+  std::string poses = "network";
+  std::string weights;  ///< of a network: its file
+  std::string network;  ///< if not empty, the network that the file must hold
   /// What the network was trained without: "", "positional_embedding" or "volume". The file must say the same.
   std::string ablation;
   int iterations = 0;  ///< K; 0: as many as the network was made for
@@ -24,7 +26,7 @@ struct TableRowPlan {
   template <class Visitor>
   void visit(Visitor&& v) {
     v("name", name, "of the row");
-    v("poses", poses, "network, registration or nominal");
+    v("poses", poses, "network, registration, search or nominal");
     v("weights", weights, "file of the network's weights");
     v("network", network, "if not empty, the network that the file must hold");
     v("ablation", ablation, "what the network was trained without: positional_embedding or volume");

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <limits>
 #include <memory>
@@ -161,8 +162,10 @@ class IncrementalEstimator {
   /// @return false if there is nothing left to improve
   virtual bool improve(const SliceSequence& /*sequence*/) { return false; }
 
-  /// Brings poses and volume to their best state; called when the scan, or a pause in it, leaves the time.
-  virtual void finalise(const SliceSequence& sequence) = 0;
+  /// Brings poses and volume to their best state; called when the scan, or a pause in it, leaves the time. It may take
+  /// tens of seconds.
+  /// @param stop if not null and set meanwhile: gives up soon, with poses and volume as they were and not final
+  virtual void finalise(const SliceSequence& sequence, const std::atomic<bool>* stop) = 0;
 
   /// Forgets everything; revisions go on counting.
   virtual void reset() = 0;

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <functional>
 #include <memory>
 #include <string>
@@ -47,7 +48,8 @@ class LivePipeline {
   bool improve();
 
   /// Final poses and volume. Does nothing (and returns false) without slices, or if they are final already.
-  bool finalise();
+  /// @param stop if not null and set meanwhile: gives up soon, nothing has changed then (and returns false)
+  bool finalise(const std::atomic<bool>* stop = nullptr);
 
   /// Forgets scan and journal.
   void reset();

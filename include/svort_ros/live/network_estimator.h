@@ -26,7 +26,7 @@ class NetworkEstimator : public NominalEstimator {
   NetworkEstimator(const EstimatorOptions& options, NetworkInstance network, const Checkpoint& about);
 
   void add(const SliceSequence& sequence) override;
-  void finalise(const SliceSequence& sequence) override;
+  void finalise(const SliceSequence& sequence, const std::atomic<bool>* stop) override;
   void reset() override;
   std::string device() const override { return runner_.device(); }
   EstimatorNotes notes() const override;

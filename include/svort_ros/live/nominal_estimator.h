@@ -18,7 +18,7 @@ class NominalEstimator : public IncrementalEstimator {
 
   void add(const SliceSequence& sequence) override;
   void update_volume(const SliceSequence& sequence) override;
-  void finalise(const SliceSequence& sequence) override;
+  void finalise(const SliceSequence& sequence, const std::atomic<bool>* stop) override;
   void reset() override;
   const Estimate& estimate() const override { return estimate_; }
   const Volume& volume() const override { return volume_; }

@@ -34,9 +34,12 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 /// answer of lowest cost.
 ///
 /// @param starts  at least one; each one pose per slice
+/// @param stop    if not null, no further step (a refinement, the stacks' matching, a piece) is begun once this is set,
+///                and the best until then is returned
 /// @throws std::invalid_argument naming what does not fit
 Refinement register_scan(const RegistrationInput& input, const std::vector<std::vector<Pose>>& starts, double size_mm,
-                         const RefinementOptions& options = {}, const TemplateOptions& match = {});
+                         const RefinementOptions& options = {}, const TemplateOptions& match = {},
+                         const std::atomic<bool>* stop = nullptr);
 
 /// What register_scan() searches for, for a scan that is still growing and whose poses have been followed: slices that
 /// lie elsewhere because the head has jumped. Without the finest level (2 mm, or RefinementOptions::finest_mm if that

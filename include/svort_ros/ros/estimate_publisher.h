@@ -33,6 +33,8 @@ class EstimatePublisher {
   void publish_estimate(const svort::LivePipeline& pipeline, std::uint64_t revision_offset);
   /// Takes note of the pipeline's new volume and publishes it and its products.
   void publish_volume(const svort::LivePipeline& pipeline, std::uint64_t revision_offset);
+  /// Poses and volume of a scan that is final, which need not be the scan in hand.
+  void publish_final(const svort::LivePipeline& pipeline, std::uint64_t revision_offset);
   /// One product again, from the last state.
   void publish(Product product, const svort::LivePipeline& pipeline);
 
@@ -51,6 +53,8 @@ class EstimatePublisher {
   ros::Publisher estimate_publisher_;
   ros::Publisher head_pose_publisher_;
   ros::Publisher volume_publisher_;
+  ros::Publisher final_estimate_publisher_;
+  ros::Publisher final_volume_publisher_;
   std::map<Product, ros::Publisher> products_;
 
   struct Sent {

@@ -47,6 +47,10 @@ class Inbox {
     const std::lock_guard<std::mutex> lock(mutex_);
     return items_.size();
   }
+  bool closed() const {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    return closed_;
+  }
 
  private:
   mutable std::mutex mutex_;

@@ -14,6 +14,8 @@ constexpr char kVolumeCloudTopic[] = "volume_cloud";      ///< out, on demand: s
 constexpr char kSurfaceTopic[] = "brain_surface";         ///< out, on demand: visualization_msgs/Marker
 constexpr char kCurrentSliceTopic[] = "current_slice";    ///< out, on demand: visualization_msgs/MarkerArray
 constexpr char kHeadPoseTopic[] = "head_pose";            ///< out, latched: geometry_msgs/PoseStamped, scanner frame
+constexpr char kFinalEstimateTopic[] = "final_estimate";  ///< out, latched: svort_ros/SequenceEstimate
+constexpr char kFinalVolumeTopic[] = "final_volume";      ///< out, latched: svort_ros/Volume, exact
 
 constexpr char kHeadMotionTopic[] = "head_motion";                 ///< out, latched: svort_ros/HeadMotion
 constexpr char kSliceQualityTopic[] = "slice_quality";             ///< out, latched: svort_ros/SequenceQuality

@@ -38,6 +38,7 @@ class NodeHealth {
   void failed(const std::string& what);      ///< an exception that is this program's own fault
   void write_failed(const std::string& what, std::size_t scans_kept_in_memory);
   void write_succeeded(std::size_t scans_kept_in_memory);
+  void set_ended_scans(std::size_t being_finalised);
 
  private:
   void report_slices(diagnostic_updater::DiagnosticStatusWrapper& status);
@@ -60,6 +61,7 @@ class NodeHealth {
   bool last_write_failed_ = false;
   std::string last_write_failure_;
   std::size_t scans_kept_ = 0;
+  std::size_t being_finalised_ = 0;
 
   diagnostic_updater::Updater updater_;
   ros::Timer timer_;

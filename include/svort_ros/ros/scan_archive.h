@@ -1,9 +1,11 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <filesystem>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "svort_ros/io/results.h"
@@ -14,6 +16,15 @@ namespace svort_ros {
 /// A scan id as the name of a folder: letters, digits, '.', '_' and '-' stay, all else becomes '_'; never empty,
 /// hidden or longer than 100 characters.
 std::string folder_name(const std::string& scan_id);
+
+/// A scan, and what is written of it.
+struct ArchivedScan {
+  std::unique_ptr<svort::LivePipeline> pipeline;
+  std::unique_ptr<svort::DecisionEngine> decisions;  ///< may be null
+  svort::RunInfo run;
+  std::filesystem::path folder;       ///< empty until it was written
+  std::uint64_t revision_offset = 0;  ///< what was added to the pipeline's revisions where they were published
+};
 
 /// Where the node writes its scans: one folder per scan below `root`. A folder that another run left is not touched,
 /// the scan's name gets a number then ("scan_2"). Saving a scan again replaces its own files.
@@ -28,12 +39,15 @@ class ScanArchive {
   std::filesystem::path save(const svort::LivePipeline& pipeline, const svort::RunInfo& run,
                              const svort::DecisionEngine* decisions = nullptr);
 
-  /// The next save() is of another scan.
-  void begin_scan() { folder_.clear(); }
+  /// The next save() is of another scan. @return the folder of the one that ends; empty if it was not saved
+  std::filesystem::path begin_scan() { return std::exchange(folder_, {}); }
+
+  /// Writes a scan that has ended, and sets its folder. Safe to call while another thread calls the other members.
+  /// @throws std::runtime_error naming the file and the reason
+  void write(ArchivedScan* scan) const { write(*scan->pipeline, scan->run, scan->decisions.get(), &scan->folder); }
 
   /// Keeps a scan that ended but could not be written; retry() tries again.
-  void keep(std::unique_ptr<svort::LivePipeline> pipeline, svort::RunInfo run,
-            std::unique_ptr<svort::DecisionEngine> decisions = nullptr);
+  void keep(ArchivedScan scan) { kept_.push_back(std::move(scan)); }
   std::size_t kept() const { return kept_.size(); }
 
   struct Retry {
@@ -44,19 +58,13 @@ class ScanArchive {
   Retry retry();
 
  private:
-  struct Kept {
-    std::unique_ptr<svort::LivePipeline> pipeline;
-    std::unique_ptr<svort::DecisionEngine> decisions;
-    svort::RunInfo run;
-    std::filesystem::path folder;
-  };
   /// Fills `folder` if it is empty, and writes.
   void write(const svort::LivePipeline& pipeline, const svort::RunInfo& run, const svort::DecisionEngine* decisions,
              std::filesystem::path* folder) const;
 
-  std::filesystem::path root_;
+  const std::filesystem::path root_;
   std::filesystem::path folder_;  ///< of the scan in hand; empty until it was saved
-  std::vector<Kept> kept_;
+  std::vector<ArchivedScan> kept_;
 };
 
 }  // namespace svort_ros
