@@ -11,6 +11,7 @@
 #include "scored_poses.h"
 #include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/live/sequence_tensors.h"
+#include "svort_ros/live/volume_update.h"
 #include "svort_ros/reconstruction/final_volume.h"
 #include "svort_ros/registration/canonical_frame.h"
 #include "svort_ros/registration/scan_registration.h"
@@ -61,10 +62,13 @@ class RadiusRatios {
     const bool one_stack = std::all_of(slices.begin(), slices.end(), [&](const SliceEstimate& slice) {
       return slice.info.stack == newest.info.stack;
     });
-    (one_stack ? one_stack_ : more_).push_back(error_mm / newest.radius_95_mm);
+    const double ratio = error_mm / newest.radius_95_mm;
+    (one_stack ? one_stack_ : more_).push_back(ratio);
+    if (agreement_of(pipeline.sequence(), slices) >= kAgreement) agreed_.push_back(ratio);
   }
   RadiusScore one_stack() const { return score(one_stack_); }
   RadiusScore more() const { return score(more_); }
+  RadiusScore agreed() const { return score(agreed_); }
 
  private:
   static std::pair<int, int> key_of(const SliceInfo& info) { return {info.stack, info.index}; }
@@ -79,7 +83,7 @@ class RadiusRatios {
   }
 
   std::map<std::pair<int, int>, Pose> truth_;
-  std::vector<double> one_stack_, more_;
+  std::vector<double> one_stack_, more_, agreed_;
 };
 
 }  // namespace
@@ -191,6 +195,7 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     answer.truth = published_truth;
     row.radius_one_stack = radius_ratios.one_stack();
     row.radius = radius_ratios.more();
+    row.radius_agreed = radius_ratios.agreed();
     if (!latency_ms.empty()) {
       std::sort(latency_ms.begin(), latency_ms.end());
       row.p95_ms = latency_ms[static_cast<std::size_t>(0.95 * static_cast<double>(latency_ms.size() - 1) + 0.5)];

@@ -149,6 +149,12 @@ const std::vector<CsvColumn<AccuracyRow>>& accuracy_columns() {
     add(
         "radius_ratio_95", [](AccuracyRow & r) -> auto& { return r.radius.ratio_95; });
     add(
+        "radius_slices_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.slices; });
+    add(
+        "radius_within_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.within; });
+    add(
+        "radius_ratio_95_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.ratio_95; });
+    add(
         "radius_slices_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.slices; });
     add(
         "radius_within_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.within; });
@@ -233,23 +239,22 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
     if (more == "-" && one == "-") return;
     if (!radii)
       text
-          << "\n| motion | poses | within their 95 % radius | first stack | from the network | searched for | relative "
-             "ED when the last had arrived, mm |\n|---|---|---|---|---|---|---|\n";
+          << "\n| motion | poses | within their 95 % radius | while slices agree | first stack | from the network | "
+             "searched for | relative ED when the last had arrived, mm |\n|---|---|---|---|---|---|---|---|\n";
     radii = true;
-    text << "| " << motion << " | " << method << " | " << more << " | " << one << " | "
+    text << "| " << motion << " | " << method << " | " << more << " | " << group.coverage(&AccuracyRow::radius_agreed)
+         << " | " << one << " | "
          << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " | "
          << group.sum([](const AccuracyRow& r) { return r.search_starts; }) << " | "
          << group.cell([](const AccuracyRow& r) { return r.followed_ed_mm; }, 2) << " |\n";
   });
   if (radii)
     text << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
-            "how "
-            "many; 0.95 quantile of error over radius, median over scans), from the second stack on and in the first. "
-            "From the network: slices that were registered from where the network had put them; searched for: those "
-            "that "
-            "a search had found elsewhere. When the last had arrived: all slices, the first stack's too, as they had "
-            "been "
-            "followed, before the end of the scan registers them anew.\n";
+            "how many; 0.95 quantile of error over radius, median over scans), from the second stack on, of these while "
+            "slices agree with each other, and in the first. From the network: slices that were registered from where "
+            "the network had put them; searched for: those that a search had found elsewhere. When the last had "
+            "arrived: all slices, the first stack's too, as they had been followed, before the end of the scan "
+            "registers them anew.\n";
   return text.str();
 }
 

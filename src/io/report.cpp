@@ -333,6 +333,9 @@ void write_report(const fs::path& directory, const LivePipeline& pipeline, const
        << "<p class='warn'>Not a medical device; do not base decisions about patients on it.</p>\n";
   for (const std::string& warning : pipeline.notes().warnings)
     html << "<p class='warn'>" << escape_html(warning) << "</p>\n";
+  if (const double agreement = pipeline.estimate().agreement; agreement < kAgreement)
+    html << "<p class='warn'>The slices do not agree with each other (" << fixed(agreement, 2) << ", should be "
+         << fixed(kAgreement, 2) << "): poses may be far off.</p>\n";
   html << motion_section(engine.motion()) << quality_section(engine) << coverage_section(directory, engine)
        << "<h2>Volume</h2>\n"
        << picture(directory / "volume.png", "the volume") << decision_section(engine, first)

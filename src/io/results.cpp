@@ -113,6 +113,7 @@ std::string run_json(const LivePipeline& pipeline, const RunInfo& run, const Dec
   json["final"] = pipeline.estimate().final;
   json["arrivals"] = arrivals;
   json["intensity_scale"] = sequence.intensity_scale();
+  json["agreement"] = pipeline.estimate().agreement;  // null if it is not known
   json["ncc"] = quality_to_json(pipeline.estimate());
   json["latency"] = latency_to_json(pipeline.journal());
   json["wall_s"] = rounded(run.wall_s);

@@ -54,11 +54,13 @@ void NominalEstimator::make_nominal() {
 
 void NominalEstimator::update_volume(const SliceSequence& sequence) {
   volume_ = estimate_volume(sequence, grid_, formulation_, options_.cg_iterations, &estimate_.slices);
+  estimate_.agreement = agreement_of(sequence, estimate_.slices);
   ++estimate_.revision;
 }
 
 void NominalEstimator::finalise(const SliceSequence& sequence, const std::atomic<bool>* /*stop*/) {
   volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
+  estimate_.agreement = agreement_of(sequence, estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;
 }

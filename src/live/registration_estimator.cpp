@@ -370,6 +370,7 @@ void RegistrationEstimator::align_to_template(const SliceSequence& sequence, con
 
 void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
   volume_ = estimate_volume(sequence, grid_, formulation_, options_.cg_iterations, &estimate_.slices);
+  estimate_.agreement = agreement_of(sequence, estimate_.slices);
   ++estimate_.revision;
 }
 
@@ -392,6 +393,7 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::a
     align_to_template(sequence, input);
   }
   volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
+  estimate_.agreement = agreement_of(sequence, estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;
 }

@@ -9,7 +9,9 @@
 #include <string>
 
 #include "svort_ros/live/slice_batch.h"
+#include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
+#include "svort_ros/registration/scan_registration.h"
 
 namespace svort {
 namespace {
@@ -90,6 +92,14 @@ ImageGrid volume_grid(const EstimatorOptions& options) {
   grid.size.setConstant(static_cast<int>(std::lround(options.volume_size_mm / options.volume_resolution_mm)));
   grid.spacing.setConstant(options.volume_resolution_mm);
   return grid;
+}
+
+double agreement_of(const SliceSequence& sequence, const std::vector<SliceEstimate>& slices) {
+  const torch::NoGradGuard no_grad;
+  std::vector<Pose> poses;
+  for (std::size_t i = 0; i < slices.size(); ++i)
+    poses.push_back(slices[i].T_brain_slice * sequence.slices()[i]->T_slice_crop);
+  return coarse_agreement(registration_input(sequence), poses);
 }
 
 Volume estimate_volume(const SliceSequence& sequence, const ImageGrid& grid, AcquisitionFormulation formulation,

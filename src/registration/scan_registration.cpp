@@ -83,6 +83,11 @@ bool several_stacks(const RegistrationInput& input) {
   return std::any_of(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
 }
 
+bool enough_across(const RegistrationInput& input) {
+  return std::count_if(input.stack.begin(), input.stack.end(),
+                       [&](int stack) { return stack != input.stack.front(); }) >= kFewestAcross;
+}
+
 /// Refinements that are tried one after another. The one whose pieces agree best stays.
 class Trials {
  public:
@@ -250,9 +255,7 @@ std::optional<Refinement> search_scan(const RegistrationInput& input, const std:
   if (followed.size() != input.count())
     throw std::invalid_argument("search_scan: " + std::to_string(followed.size()) + " poses for " +
                                 std::to_string(input.count()) + " slices");
-  const auto across =
-      std::count_if(input.stack.begin(), input.stack.end(), [&](int stack) { return stack != input.stack.front(); });
-  if (across < kFewestAcross) return std::nullopt;
+  if (!enough_across(input)) return std::nullopt;
   const auto stopped = [&] { return stop && stop->load(); };
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
   Trials trials(input, options);
@@ -284,6 +287,7 @@ double coarse_agreement(const RegistrationInput& input, const std::vector<Pose>&
   if (poses.size() != input.count())
     throw std::invalid_argument("coarse_agreement: " + std::to_string(poses.size()) + " poses for " +
                                 std::to_string(input.count()) + " slices");
+  if (!enough_across(input)) return std::numeric_limits<double>::quiet_NaN();
   return ScanPieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm).agreement(poses);
 }
 

@@ -243,6 +243,7 @@ SequenceEstimate to_msg(const svort::Estimate& estimate, const std::string& scan
   message.revision = estimate.revision;
   message.frame_revision = estimate.frame_revision;
   message.scanner_frame = scanner_frame;
+  message.agreement = estimate.agreement;
   message.final = estimate.final;
   message.slices.reserve(estimate.slices.size());
   for (const svort::SliceEstimate& slice : estimate.slices) {

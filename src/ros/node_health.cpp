@@ -59,6 +59,11 @@ void NodeHealth::volume_published(double latency_ms) {
   push_bounded(&volume_latencies_ms_, latency_ms);
 }
 
+void NodeHealth::set_agreement(double agreement) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  agreement_ = agreement;
+}
+
 void NodeHealth::failed(const std::string& what) {
   const std::lock_guard<std::mutex> lock(mutex_);
   ++failures_;
@@ -128,6 +133,10 @@ void NodeHealth::report_estimator(diagnostic_updater::DiagnosticStatusWrapper& s
     status.summaryf(DiagnosticStatus::ERROR, "%zu internal errors, the last: %s", failures_, last_failure_.c_str());
   else if (estimator_.method == "nominal")
     status.summary(DiagnosticStatus::WARN, "poses are nominal: the scanner's own, no head motion is estimated");
+  else if (agreement_ < svort::kAgreement)
+    status.summaryf(DiagnosticStatus::WARN,
+                    "slices do not agree with each other (%.2f, should be %.2f): poses may be far off", agreement_,
+                    svort::kAgreement);
   else if (!estimator_.warnings.empty())
     status.summary(DiagnosticStatus::WARN, estimator_.warnings.back());
   else
@@ -135,6 +144,7 @@ void NodeHealth::report_estimator(diagnostic_updater::DiagnosticStatusWrapper& s
   status.add("method", estimator_.method);
   status.add("device", estimator_.device);
   status.add("threads", estimator_.threads);
+  status.add("agreement of slices", agreement_);
 }
 
 void NodeHealth::report_results(diagnostic_updater::DiagnosticStatusWrapper& status) {

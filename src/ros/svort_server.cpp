@@ -155,6 +155,7 @@ class SvortServer::Worker {
   void improve();
   void report_estimator();
   void publish_volume();
+  void report_agreement();
   void decide();
   void publish_estimate();
   void save_at_exit();
@@ -199,6 +200,7 @@ class SvortServer::Worker {
   bool estimate_is_new_ = false;
   bool has_unsaved_ = false;
   std::size_t warned_ = 0;  ///< warnings of the estimator that are in the log
+  bool agreed_ = true;      ///< the last estimate did, as far as known
 
   ros::Publisher status_publisher_;
   EstimatePublisher publisher_;
@@ -379,6 +381,7 @@ void SvortServer::Worker::improve() {
 void SvortServer::Worker::publish_volume() {
   publisher_.publish_volume(*pipeline_, revision_offset_);
   publish_estimate();  // with the volume came each slice's ncc
+  report_agreement();
   const std::vector<AwaitingVolume::Published> published = awaiting_volume_.volume_published(*pipeline_);
   guarded([&] { decide(); });
   for (const AwaitingVolume::Published& slice : published) {
@@ -387,6 +390,20 @@ void SvortServer::Worker::publish_volume() {
     ROS_INFO("%s", slice.line.c_str());
   }
   has_unsaved_ = true;
+}
+
+void SvortServer::Worker::report_agreement() {
+  const double agreement = pipeline_->estimate().agreement;
+  health_.set_agreement(agreement);
+  const bool agrees = !(agreement < svort::kAgreement);
+  if (agrees == agreed_) return;
+  agreed_ = agrees;
+  if (agrees)
+    ROS_INFO("slices agree with each other again (%.2f)", agreement);
+  else
+    ROS_WARN("slices do not agree with each other (%.2f, should be %.2f): the head has jumped or turned far; poses may "
+             "be far off until they do again",
+             agreement, svort::kAgreement);
 }
 
 void SvortServer::Worker::decide() {

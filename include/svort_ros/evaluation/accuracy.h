@@ -68,6 +68,8 @@ struct AccuracyRow {
   /// Live: causal poses, relative to the other slices as they were at that moment, in the first stack and from the
   /// second on.
   RadiusScore radius_one_stack, radius;
+  /// Of `radius`, those that came while the slices agreed with each other (kAgreement).
+  RadiusScore radius_agreed;
   std::size_t network_starts = 0;  ///< live: slices that were registered from where the network had put them
   std::size_t search_starts = 0;   ///< live: slices that a search found, when the last one had arrived
   /// Live: relative ED of all slices, first stack included, as they had been followed when the last one had arrived.

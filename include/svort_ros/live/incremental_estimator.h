@@ -47,12 +47,19 @@ struct SliceEstimate {
   double radius_95_mm = std::numeric_limits<double>::quiet_NaN();
 };
 
+/// Poses whose Estimate::agreement is lower are not to be trusted; docs/live.md says what was measured.
+constexpr double kAgreement = 0.9;
+
 /// One published state. All poses belong together; the volume may be from an earlier revision.
 struct Estimate {
   std::string scan_id;
   std::uint64_t revision = 0;         ///< counts every change of poses or volume, from 1
   std::uint64_t frame_revision = 0;   ///< counts moves of the brain frame itself, from 0: the head did not move then
   std::vector<SliceEstimate> slices;  ///< in acquisition order
+  /// How well the slices agree with each other: correlation of runs of about 8 slices, blurred, with the volume of all
+  /// others (coarse_agreement()), of the last volume's poses. Below kAgreement the head has jumped or turned farther
+  /// than could be followed: poses may be far off, by much more than their radii say. NaN: not known yet.
+  double agreement = std::numeric_limits<double>::quiet_NaN();
   std::size_t encoded = 0;            ///< slices that a network encoded for this revision
   bool final = false;                 ///< set by finalise(), until the next slice
 };

@@ -17,6 +17,10 @@ void validate(const EstimatorOptions& options);
 /// The cube that EstimatorOptions ask for, centred on the brain frame.
 ImageGrid volume_grid(const EstimatorOptions& options);
 
+/// Estimate::agreement of poses.
+/// @param slices one per slice of the sequence, in its order
+double agreement_of(const SliceSequence& sequence, const std::vector<SliceEstimate>& slices);
+
 /// Volume from the slices' current poses and weights; sets each slice's ncc.
 ///
 /// @param slices        one per slice of the sequence, in its order; weights count in the volume

@@ -57,7 +57,7 @@ std::optional<Refinement> search_scan(const RegistrationInput& input, const std:
 /// How well a scan's poses agree: its pieces, runs of about 8 slices, each correlated with the volume of all others,
 /// blurred (4 mm pixels).
 /// @param poses one per slice
-/// @return in [-1, 1]; -1 if there are fewer than two pieces with brain in them
+/// @return in [-1, 1]; NaN if fewer than 8 slices lie across the first stack: the pieces of one stack agree anywhere
 /// @throws std::invalid_argument naming what does not fit
 double coarse_agreement(const RegistrationInput& input, const std::vector<Pose>& poses);
 

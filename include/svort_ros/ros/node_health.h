@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <deque>
 #include <functional>
+#include <limits>
 #include <map>
 #include <mutex>
 #include <string>
@@ -35,6 +36,7 @@ class NodeHealth {
   void set_estimator(Estimator estimator);
   void slice_answered(svort::ArrivalStatus status, double latency_ms);
   void volume_published(double latency_ms);  ///< once for every slice that is new in the volume
+  void set_agreement(double agreement);      ///< see svort::Estimate
   void failed(const std::string& what);      ///< an exception that is this program's own fault
   void write_failed(const std::string& what, std::size_t scans_kept_in_memory);
   void write_succeeded(std::size_t scans_kept_in_memory);
@@ -54,6 +56,7 @@ class NodeHealth {
   std::deque<Clock::time_point> recent_arrivals_;
   std::deque<double> pose_latencies_ms_;
   std::deque<double> volume_latencies_ms_;
+  double agreement_ = std::numeric_limits<double>::quiet_NaN();
   std::size_t failures_ = 0;
   std::string last_failure_;
   std::size_t writes_ = 0;
