@@ -157,9 +157,6 @@ Placing place_piece(const Piece& piece, const SampledVolume& volume, const Eigen
 
 SampledVolume faded_volume(const WeightedVolume& sums, double voxel_mm, Eigen::Vector3d* centre) {
   const auto size = static_cast<int>(sums.sums.size(0));
-  const auto values_of = [](const torch::Tensor& volume) {
-    return std::vector<float>(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
-  };
   std::vector<float> values = blurred(values_of(sums.sums), size, kVoxelBlur);
   const std::vector<float> seen_by = blurred(values_of(sums.support), size, kVoxelBlur);
   const float least =

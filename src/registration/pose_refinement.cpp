@@ -22,10 +22,6 @@ namespace {
 constexpr double kFwhmPerSigma = 2.354820045;
 constexpr double kInPlaneFwhm = 1.2;  // pixels (paper, sec. 2)
 
-std::vector<float> values_of(const torch::Tensor& volume) {
-  return std::vector<float>(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
-}
-
 struct LevelPlan {
   double pixel_mm, blur_mm;
   int passes;

@@ -11,6 +11,10 @@ torch::Tensor WeightedVolume::mean() const {
   return torch::where(support > least, sums / support.clamp_min(least), torch::zeros_like(sums));
 }
 
+std::vector<float> values_of(const torch::Tensor& volume) {
+  return std::vector<float>(volume.data_ptr<float>(), volume.data_ptr<float>() + volume.numel());
+}
+
 WeightedVolume weighted_volume(const torch::Tensor& slices, const SliceAcquisition& acquisition,
                                const std::vector<double>& weights) {
   torch::Tensor w = torch::empty({static_cast<std::int64_t>(weights.size()), 1, 1, 1}, torch::kFloat32);

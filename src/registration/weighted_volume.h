@@ -19,6 +19,9 @@ struct WeightedVolume {
   torch::Tensor mean() const;
 };
 
+/// The voxels of a contiguous float32 volume on the CPU.
+std::vector<float> values_of(const torch::Tensor& volume);
+
 /// @param slices  n x 1 x h x w
 /// @param weights n
 WeightedVolume weighted_volume(const torch::Tensor& slices, const SliceAcquisition& acquisition,

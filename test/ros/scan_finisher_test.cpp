@@ -66,7 +66,7 @@ TEST(ScanFinisher, FinalisesAndWritesInOrder) {
 TEST(ScanFinisher, StoppedItWritesWhatThereIs) {
   svort::PipelineOptions slow = svort_test::small_pipeline();
   slow.estimator.method = "registration";
-  slow.estimator.final_volume.resolution_mm = 1.;
+  slow.estimator.registration.finest_mm = 3.;
   const svort_test::TemporaryFolder folder;
   const ScanArchive archive(folder.path());
   Results results;

@@ -17,6 +17,7 @@ inline svort::PipelineOptions small_pipeline() {
   options.sequence.resolution_mm = 3.;
   options.estimator.volume_resolution_mm = 4.;
   options.estimator.volume_size_mm = 96.;
+  options.estimator.final_volume.resolution_mm = 4.;
   return options;
 }
 
