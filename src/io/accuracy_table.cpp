@@ -238,23 +238,22 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
     const std::string more = group.coverage(&AccuracyRow::radius), one = group.coverage(&AccuracyRow::radius_one_stack);
     if (more == "-" && one == "-") return;
     if (!radii)
-      text
-          << "\n| motion | poses | within their 95 % radius | while slices agree | first stack | from the network | "
-             "searched for | relative ED when the last had arrived, mm |\n|---|---|---|---|---|---|---|---|\n";
+      text << "\n| motion | poses | within their 95 % radius | while slices agree | first stack | from the network | "
+              "searched for | relative ED when the last had arrived, mm |\n|---|---|---|---|---|---|---|---|\n";
     radii = true;
     text << "| " << motion << " | " << method << " | " << more << " | " << group.coverage(&AccuracyRow::radius_agreed)
-         << " | " << one << " | "
-         << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " | "
+         << " | " << one << " | " << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " | "
          << group.sum([](const AccuracyRow& r) { return r.search_starts; }) << " | "
          << group.cell([](const AccuracyRow& r) { return r.followed_ed_mm; }, 2) << " |\n";
   });
   if (radii)
-    text << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
-            "how many; 0.95 quantile of error over radius, median over scans), from the second stack on, of these while "
-            "slices agree with each other, and in the first. From the network: slices that were registered from where "
-            "the network had put them; searched for: those that a search had found elsewhere. When the last had "
-            "arrived: all slices, the first stack's too, as they had been followed, before the end of the scan "
-            "registers them anew.\n";
+    text
+        << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
+           "how many; 0.95 quantile of error over radius, median over scans), from the second stack on, of these while "
+           "slices agree with each other, and in the first. From the network: slices that were registered from where "
+           "the network had put them; searched for: those that a search had found elsewhere. When the last had "
+           "arrived: all slices, the first stack's too, as they had been followed, before the end of the scan "
+           "registers them anew.\n";
   return text.str();
 }
 

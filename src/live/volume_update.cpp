@@ -8,8 +8,8 @@
 #include <stdexcept>
 #include <string>
 
-#include "svort_ros/live/slice_batch.h"
 #include "svort_ros/live/sequence_tensors.h"
+#include "svort_ros/live/slice_batch.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
 #include "svort_ros/registration/scan_registration.h"
 

@@ -401,9 +401,10 @@ void SvortServer::Worker::report_agreement() {
   if (agrees)
     ROS_INFO("slices agree with each other again (%.2f)", agreement);
   else
-    ROS_WARN("slices do not agree with each other (%.2f, should be %.2f): the head has jumped or turned far; poses may "
-             "be far off until they do again",
-             agreement, svort::kAgreement);
+    ROS_WARN(
+        "slices do not agree with each other (%.2f, should be %.2f): the head has jumped or turned far; poses may "
+        "be far off until they do again",
+        agreement, svort::kAgreement);
 }
 
 void SvortServer::Worker::decide() {

@@ -60,8 +60,8 @@ struct Estimate {
   /// others (coarse_agreement()), of the last volume's poses. Below kAgreement the head has jumped or turned farther
   /// than could be followed: poses may be far off, by much more than their radii say. NaN: not known yet.
   double agreement = std::numeric_limits<double>::quiet_NaN();
-  std::size_t encoded = 0;            ///< slices that a network encoded for this revision
-  bool final = false;                 ///< set by finalise(), until the next slice
+  std::size_t encoded = 0;  ///< slices that a network encoded for this revision
+  bool final = false;       ///< set by finalise(), until the next slice
 };
 
 /// For the method "network", and for the live network as one of the candidates of the method "registration".
