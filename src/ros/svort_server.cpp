@@ -11,6 +11,7 @@
 #include <exception>
 #include <functional>
 #include <future>
+#include <limits>
 #include <set>
 #include <string>
 #include <thread>
@@ -156,6 +157,7 @@ class SvortServer::Worker {
   void report_estimator();
   void publish_volume();
   void report_agreement();
+  void forget_agreement();
   void decide();
   void publish_estimate();
   void save_at_exit();
@@ -353,6 +355,7 @@ void SvortServer::Worker::end_scan() {
   finisher_.take(std::move(ended));
   health_.set_ended_scans(finisher_.count());
   ended_scans_.insert(scan_id);
+  forget_agreement();
   publisher_.begin_scan();
   progress_.clear();
   awaiting_volume_.clear();
@@ -390,6 +393,11 @@ void SvortServer::Worker::publish_volume() {
     ROS_INFO("%s", slice.line.c_str());
   }
   has_unsaved_ = true;
+}
+
+void SvortServer::Worker::forget_agreement() {
+  agreed_ = true;
+  health_.set_agreement(std::numeric_limits<double>::quiet_NaN());
 }
 
 void SvortServer::Worker::report_agreement() {
@@ -481,6 +489,7 @@ CommandAnswer SvortServer::Worker::reset() {
   const std::size_t slices = pipeline_->sequence().slices().size();
   pipeline_->reset();
   ended_scans_.clear();
+  forget_agreement();
   archive_.begin_scan();
   progress_.clear();
   awaiting_volume_.clear();

@@ -211,6 +211,26 @@ TEST(RegistrationEstimator, ASearchThatIsNotWantedAnyMoreIsGivenUp) {
   }
 }
 
+TEST(RegistrationEstimator, AgreementTellsPosesThatAreNotToBeTrusted) {
+  PipelineOptions options = quick_options();
+  options.estimator.method = "nominal";  // a head that jumps is in the wrong place
+  const auto agreement = [&](std::size_t jump_at, std::size_t slices) {
+    Pose jump = Pose::Identity();
+    jump.linear() = Eigen::AngleAxisd(0.9, Eigen::Vector3d(1., -2., 1.).normalized()).toRotationMatrix();
+    jump.translation() = Eigen::Vector3d(8., 6., -5.);
+    const Scan scan = moving_scan(3, jump_at, jump);
+    LivePipeline pipeline(options);
+    for (std::size_t i = 0; i < slices; ++i) pipeline.add(scan.slices[i]);
+    EXPECT_TRUE(std::isnan(pipeline.estimate().agreement)) << "no volume yet";
+    pipeline.update_volume();
+    return pipeline.estimate().agreement;
+  };
+  EXPECT_TRUE(std::isnan(agreement(0, 23))) << "7 slices across the first stack say little";
+  EXPECT_GT(agreement(0, 24), kAgreement);
+  EXPECT_GT(agreement(0, 48), kAgreement);
+  EXPECT_LT(agreement(20, 48), kAgreement);
+}
+
 TEST(RegistrationEstimator, FindsTheCanonicalFrameWithATemplate) {
   const Scan scan = moving_scan();
   LivePipeline pipeline(quick_options(), {phantom_template()});
