@@ -42,14 +42,15 @@ Pose frame_motion(const std::vector<SliceEstimate>& before, const std::vector<Sl
                            : global_alignment(poses_tensor(old_poses), poses_tensor(new_poses), kEvaluationFrame);
 }
 
-/// Errors of causal poses over their radii; the other slices, where they were at that moment, hold the frame.
-class RadiusRatios {
+/// Errors of causal poses, over their radii, and told by agreement; the other slices, where they were at that moment,
+/// hold the frame.
+class CausalErrors {
  public:
   void add(const LivePipeline& pipeline, const Pose& truth) {
     const SliceEstimate& newest = *pipeline.newest();
     const std::vector<SliceEstimate>& slices = pipeline.estimate().slices;
     truth_[key_of(newest.info)] = truth;
-    if (newest.status != PoseStatus::registered || !std::isfinite(newest.radius_95_mm)) return;
+    if (slices.size() < 2) return;
     std::vector<Pose> here, there;
     for (const SliceEstimate& slice : slices) {
       if (key_of(slice.info) == key_of(newest.info)) continue;
@@ -62,16 +63,24 @@ class RadiusRatios {
     const bool one_stack = std::all_of(slices.begin(), slices.end(), [&](const SliceEstimate& slice) {
       return slice.info.stack == newest.info.stack;
     });
-    const double ratio = error_mm / newest.radius_95_mm;
-    (one_stack ? one_stack_ : more_).push_back(ratio);
-    if (agreement_of(pipeline.sequence(), slices) >= kAgreement) agreed_.push_back(ratio);
+    const double agreement = agreement_of(pipeline.sequence(), slices);
+    if (std::isfinite(agreement)) count(error_mm, agreement < kAgreement);
+    if (newest.status != PoseStatus::registered || !std::isfinite(newest.radius_95_mm)) return;
+    (one_stack ? one_stack_ : more_).push_back(error_mm / newest.radius_95_mm);
   }
   RadiusScore one_stack() const { return score(one_stack_); }
   RadiusScore more() const { return score(more_); }
-  RadiusScore agreed() const { return score(agreed_); }
+  const AgreementScore& agreement() const { return agreement_; }
 
  private:
   static std::pair<int, int> key_of(const SliceInfo& info) { return {info.stack, info.index}; }
+  void count(double error_mm, bool warned) {
+    constexpr double kFarMm = 10., kNearMm = 3.;
+    agreement_.far += error_mm > kFarMm;
+    agreement_.far_warned += error_mm > kFarMm && warned;
+    agreement_.near += error_mm < kNearMm;
+    agreement_.near_warned += error_mm < kNearMm && warned;
+  }
   static RadiusScore score(std::vector<double> ratios) {
     RadiusScore result;
     if (ratios.empty()) return result;
@@ -83,7 +92,8 @@ class RadiusRatios {
   }
 
   std::map<std::pair<int, int>, Pose> truth_;
-  std::vector<double> one_stack_, more_, agreed_;
+  std::vector<double> one_stack_, more_;
+  AgreementScore agreement_;
 };
 
 }  // namespace
@@ -113,7 +123,7 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   LivePipeline pipeline(options);
   std::vector<std::pair<const SliceInfo*, Pose>> truth_of;
   std::vector<double> latency_ms;
-  RadiusRatios radius_ratios;
+  CausalErrors causal;
   Answer answer;
   std::vector<Pose> published;
   std::vector<Pose> published_truth;
@@ -128,7 +138,7 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     const double ms = 1e3 * arrival.seconds();
     const std::size_t count = pipeline.estimate().slices.size();
     if (count >= 80) latency_ms.push_back(ms);
-    radius_ratios.add(pipeline, scan.truth[i]);
+    causal.add(pipeline, scan.truth[i]);
     if (pipeline.newest()->start.rfind("network", 0) == 0) ++row.network_starts;
     // Where the brain frame was moved, and said so, what was published before moves with it.
     if (pipeline.estimate().frame_revision != frame_revision && !published.empty()) {
@@ -193,9 +203,9 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
           summarise(relative_pose_errors(poses_tensor(followed), poses_tensor(answer.truth), kEvaluationFrame).ed).mean;
     answer.T_brain_slice = published;
     answer.truth = published_truth;
-    row.radius_one_stack = radius_ratios.one_stack();
-    row.radius = radius_ratios.more();
-    row.radius_agreed = radius_ratios.agreed();
+    row.radius_one_stack = causal.one_stack();
+    row.radius = causal.more();
+    row.agreement = causal.agreement();
     if (!latency_ms.empty()) {
       std::sort(latency_ms.begin(), latency_ms.end());
       row.p95_ms = latency_ms[static_cast<std::size_t>(0.95 * static_cast<double>(latency_ms.size() - 1) + 0.5)];

@@ -53,6 +53,14 @@ class Group {
     for (const AccuracyRow* row : rows_) result += value(*row);
     return result;
   }
+  /// "percent (of how many)"
+  std::string warned(std::size_t AgreementScore::*all, std::size_t AgreementScore::*warned) const {
+    const std::size_t slices = sum([&](const AccuracyRow& row) { return row.agreement.*all; });
+    if (slices == 0) return "-";
+    const std::size_t told = sum([&](const AccuracyRow& row) { return row.agreement.*warned; });
+    return fixed(100. * static_cast<double>(told) / static_cast<double>(slices), 0) + " (" + std::to_string(slices) +
+           ")";
+  }
   /// "percent within (of how many; ratio)"
   std::string coverage(RadiusScore AccuracyRow::*radius) const {
     const std::size_t slices = sum([&](const AccuracyRow& row) { return (row.*radius).slices; });
@@ -149,11 +157,13 @@ const std::vector<CsvColumn<AccuracyRow>>& accuracy_columns() {
     add(
         "radius_ratio_95", [](AccuracyRow & r) -> auto& { return r.radius.ratio_95; });
     add(
-        "radius_slices_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.slices; });
+        "far_slices", [](AccuracyRow & r) -> auto& { return r.agreement.far; });
     add(
-        "radius_within_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.within; });
+        "far_warned", [](AccuracyRow & r) -> auto& { return r.agreement.far_warned; });
     add(
-        "radius_ratio_95_agreed", [](AccuracyRow & r) -> auto& { return r.radius_agreed.ratio_95; });
+        "near_slices", [](AccuracyRow & r) -> auto& { return r.agreement.near; });
+    add(
+        "near_warned", [](AccuracyRow & r) -> auto& { return r.agreement.near_warned; });
     add(
         "radius_slices_one_stack", [](AccuracyRow & r) -> auto& { return r.radius_one_stack.slices; });
     add(
@@ -238,22 +248,27 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
     const std::string more = group.coverage(&AccuracyRow::radius), one = group.coverage(&AccuracyRow::radius_one_stack);
     if (more == "-" && one == "-") return;
     if (!radii)
-      text << "\n| motion | poses | within their 95 % radius | while slices agree | first stack | from the network | "
-              "searched for | relative ED when the last had arrived, mm |\n|---|---|---|---|---|---|---|---|\n";
+      text << "\n| motion | poses | within their 95 % radius | first stack | far off, warned of | near, warned of | "
+              "from "
+              "the network | searched for | relative ED when the last had arrived, mm "
+              "|\n|---|---|---|---|---|---|---|---|---|\n";
     radii = true;
-    text << "| " << motion << " | " << method << " | " << more << " | " << group.coverage(&AccuracyRow::radius_agreed)
-         << " | " << one << " | " << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " | "
+    text << "| " << motion << " | " << method << " | " << more << " | " << one << " | "
+         << group.warned(&AgreementScore::far, &AgreementScore::far_warned) << " | "
+         << group.warned(&AgreementScore::near, &AgreementScore::near_warned) << " | "
+         << group.sum([](const AccuracyRow& r) { return r.network_starts; }) << " | "
          << group.sum([](const AccuracyRow& r) { return r.search_starts; }) << " | "
          << group.cell([](const AccuracyRow& r) { return r.followed_ed_mm; }, 2) << " |\n";
   });
   if (radii)
-    text
-        << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
-           "how many; 0.95 quantile of error over radius, median over scans), from the second stack on, of these while "
-           "slices agree with each other, and in the first. From the network: slices that were registered from where "
-           "the network had put them; searched for: those that a search had found elsewhere. When the last had "
-           "arrived: all slices, the first stack's too, as they had been followed, before the end of the scan "
-           "registers them anew.\n";
+    text << "\nRegistered slices of all scans at their arrival, relative to the others: percent within the radius (of "
+            "how many; 0.95 quantile of error over radius, median over scans), from the second stack on and in the "
+            "first. "
+            "Far off, near: slices that were off by more than 10 mm, less than 3 mm, once agreement was known; percent "
+            "that low agreement warned of (of how many). From the network: slices that were registered from where the "
+            "network had put them; searched for: those that a search had found elsewhere. When the last had arrived: "
+            "all slices, the first stack's too, as they had been followed, before the end of the scan registers them "
+            "anew.\n";
   return text.str();
 }
 

@@ -61,7 +61,8 @@ TEST_F(AccuracyTable, PoolsTheSlicesWithinTheirRadii) {
   first.radius = {60, 59, 0.8};
   second.radius = {40, 30, 1.6};
   first.radius_one_stack = {20, 19, 0.9};
-  first.radius_agreed = {50, 48, 0.7};
+  first.agreement = {20, 17, 30, 1};
+  second.agreement = {0, 0, 20, 1};
   second.network_starts = 3;
   second.search_starts = 5;
   first.followed_ed_mm = 1.;
@@ -69,7 +70,7 @@ TEST_F(AccuracyTable, PoolsTheSlicesWithinTheirRadii) {
   const auto path = folder_ / "accuracy.csv";
   write_accuracy_rows(path, {first, second});
   const std::string table = accuracy_markdown(read_accuracy_rows(path));
-  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 96.0 (50; 0.70) | 95.0 (20; 0.90) | 3 | 5 | 1.75 / 1.75 |"),
+  EXPECT_NE(table.find("| mild | live | 89.0 (100; 1.20) | 95.0 (20; 0.90) | 85 (20) | 4 (50) | 3 | 5 | 1.75 / 1.75 |"),
             std::string::npos)
       << table;
   EXPECT_EQ(accuracy_markdown({row("nominal", 1, 1.)}).find("radius"), std::string::npos) << "no radii, no table";

@@ -30,6 +30,12 @@ struct PoseMethod {
   bool with_volume = false;  ///< reconstruct volumes from these poses and compare them with the truth
 };
 
+/// Whether low agreement (kAgreement) tells poses that are far off. Live, all slices from when it is known.
+struct AgreementScore {
+  std::size_t far = 0, far_warned = 0;    ///< slices off by more than 10 mm at their arrival; those with a warning
+  std::size_t near = 0, near_warned = 0;  ///< by less than 3 mm
+};
+
 /// Errors of poses in one canonical frame.
 struct FrameScore {
   double ed_mm = std::numeric_limits<double>::quiet_NaN(), gd_rad = std::numeric_limits<double>::quiet_NaN();
@@ -68,8 +74,7 @@ struct AccuracyRow {
   /// Live: causal poses, relative to the other slices as they were at that moment, in the first stack and from the
   /// second on.
   RadiusScore radius_one_stack, radius;
-  /// Of `radius`, those that came while the slices agreed with each other (kAgreement).
-  RadiusScore radius_agreed;
+  AgreementScore agreement;
   std::size_t network_starts = 0;  ///< live: slices that were registered from where the network had put them
   std::size_t search_starts = 0;   ///< live: slices that a search found, when the last one had arrived
   /// Live: relative ED of all slices, first stack included, as they had been followed when the last one had arrived.

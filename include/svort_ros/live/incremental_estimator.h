@@ -48,7 +48,7 @@ struct SliceEstimate {
 };
 
 /// Poses whose Estimate::agreement is lower are not to be trusted; docs/live.md says what was measured.
-constexpr double kAgreement = 0.9;
+constexpr double kAgreement = 0.88;
 
 /// One published state. All poses belong together; the volume may be from an earlier revision.
 struct Estimate {
