@@ -406,15 +406,16 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
   cv::rotate(label, label, cv::ROTATE_90_COUNTERCLOCKWISE);
   label.copyTo(image(cv::Rect(8, frame.y + frame.height / 2 - 200, label.cols, label.rows)));
 
-  const std::array<cv::Scalar, 9> colours = {kBlue,
-                                             kOrange,
-                                             kRed,
-                                             cv::Scalar(115, 158, 0),
-                                             cv::Scalar(167, 121, 204),
-                                             cv::Scalar(100, 100, 100),
-                                             cv::Scalar(233, 180, 86),
-                                             cv::Scalar(66, 228, 240),
-                                             cv::Scalar(40, 40, 110)};
+  const std::array<cv::Scalar, 10> colours = {kBlue,
+                                              kOrange,
+                                              kRed,
+                                              cv::Scalar(115, 158, 0),
+                                              cv::Scalar(167, 121, 204),
+                                              cv::Scalar(100, 100, 100),
+                                              cv::Scalar(233, 180, 86),
+                                              cv::Scalar(66, 228, 240),
+                                              cv::Scalar(40, 40, 110),
+                                              cv::Scalar(60, 190, 150)};
   for (std::size_t i = 0; i < curves.size(); ++i) {
     const cv::Scalar& colour = colours[i % colours.size()];
     std::vector<cv::Point> line;
