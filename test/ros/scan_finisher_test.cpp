@@ -23,7 +23,7 @@ ArchivedScan ended(const std::string& scan_id, const svort::PipelineOptions& opt
   return scan;
 }
 
-/// What was done, in order.
+/// What was done, in order; look after stop().
 class Results {
  public:
   ScanFinisher::Done done() {
@@ -32,12 +32,27 @@ class Results {
       scans_.push_back(std::move(scan));
     };
   }
-  std::vector<FinishedScan>& all() { return scans_; }  ///< after stop()
+  std::vector<FinishedScan>& all() { return scans_; }
 
  private:
   std::mutex mutex_;
   std::vector<FinishedScan> scans_;
 };
+
+/// stop() alone would give up what is waiting.
+void stop_when_done(ScanFinisher& finisher) {
+  while (finisher.count() > 0) std::this_thread::sleep_for(std::chrono::milliseconds(1));
+  finisher.stop();
+}
+
+FinishedScan finish_one(const ScanArchive& archive) {
+  Results results;
+  ScanFinisher finisher(archive, results.done());
+  finisher.take(ended("a"));
+  stop_when_done(finisher);
+  EXPECT_EQ(results.all().size(), 1U);
+  return results.all().empty() ? FinishedScan() : std::move(results.all().front());
+}
 
 TEST(ScanFinisher, FinalisesAndWritesInOrder) {
   const svort_test::TemporaryFolder folder;
@@ -46,8 +61,7 @@ TEST(ScanFinisher, FinalisesAndWritesInOrder) {
   ScanFinisher finisher(archive, results.done());
   const int threads = svort::thread_count();
   for (const char* name : {"a", "b", "c"}) finisher.take(ended(name));
-  while (finisher.count() > 0) std::this_thread::sleep_for(std::chrono::milliseconds(1));
-  finisher.stop();
+  stop_when_done(finisher);
   ASSERT_EQ(results.all().size(), 3U);
   for (std::size_t i = 0; i < 3; ++i) {
     const FinishedScan& scan = results.all()[i];
@@ -93,32 +107,21 @@ TEST(ScanFinisher, WhatCannotBeWrittenComesBackWithTheReason) {
   const fs::path root = folder.path() / "results";
   std::ofstream(root) << "a file where the folder should be";
   const ScanArchive archive(root);
-  Results results;
-  ScanFinisher finisher(archive, results.done());
-  finisher.take(ended("a"));
-  while (finisher.count() > 0) std::this_thread::sleep_for(std::chrono::milliseconds(1));
-  finisher.stop();
-  ASSERT_EQ(results.all().size(), 1U);
-  FinishedScan& scan = results.all().front();
+  FinishedScan scan = finish_one(archive);
   EXPECT_TRUE(scan.final);
   EXPECT_FALSE(scan.written);
   EXPECT_NE(scan.not_written.find(root.string()), std::string::npos) << scan.not_written;
   fs::remove(root);
+  ASSERT_NE(scan.scan.pipeline, nullptr);
   archive.write(&scan.scan);
   EXPECT_TRUE(fs::exists(root / "a" / "run.json"));
 }
 
 TEST(ScanFinisher, WithoutAFolderItFinalisesOnly) {
-  const ScanArchive archive("");
-  Results results;
-  ScanFinisher finisher(archive, results.done());
-  finisher.take(ended("a"));
-  while (finisher.count() > 0) std::this_thread::sleep_for(std::chrono::milliseconds(1));
-  finisher.stop();
-  ASSERT_EQ(results.all().size(), 1U);
-  EXPECT_TRUE(results.all().front().final);
-  EXPECT_FALSE(results.all().front().written);
-  EXPECT_EQ(results.all().front().not_written, "");
+  const FinishedScan scan = finish_one(ScanArchive(""));
+  EXPECT_TRUE(scan.final);
+  EXPECT_FALSE(scan.written);
+  EXPECT_EQ(scan.not_written, "");
 }
 
 }  // namespace

@@ -57,8 +57,8 @@ struct Estimate {
   std::uint64_t frame_revision = 0;   ///< counts moves of the brain frame itself, from 0: the head did not move then
   std::vector<SliceEstimate> slices;  ///< in acquisition order
   /// How well the slices agree with each other: correlation of runs of about 8 slices, blurred, with the volume of all
-  /// others (coarse_agreement()), of the last volume's poses. Below kAgreement the head has jumped or turned farther
-  /// than could be followed: poses may be far off, by much more than their radii say. NaN: not known yet.
+  /// others (coarse_agreement()), of the last volume's poses. Below kAgreement the head has often jumped or turned
+  /// farther than could be followed: poses may be far off, by much more than their radii say. NaN: not known yet.
   double agreement = std::numeric_limits<double>::quiet_NaN();
   std::size_t encoded = 0;  ///< slices that a network encoded for this revision
   bool final = false;       ///< set by finalise(), until the next slice
