@@ -29,6 +29,7 @@ std::string names_of(const std::vector<BrainVolume>& volumes) {
 }
 
 constexpr const char* kStartedFrom = "started from";
+constexpr const char* kStartedAnew = "started anew";  // parameters that those weights did not have
 constexpr const char* kScansBefore = "scans before";  // seen by the weights that training started from
 
 // The moving average of the weights, in the file that the node and the replay take.
@@ -73,7 +74,7 @@ std::shared_ptr<TrainingRecipe> recipe_of(const TrainingConfig& config, const Ne
 void take_over_start(const std::filesystem::path& weights, Provenance* provenance) {
   if (!std::filesystem::exists(weights)) return;
   const Provenance before = read_checkpoint(weights).provenance;
-  for (const char* key : {kStartedFrom, kScansBefore})
+  for (const char* key : {kStartedFrom, kScansBefore, kStartedAnew})
     if (const auto found = before.find(key); found != before.end()) (*provenance)[key] = found->second;
 }
 
@@ -147,15 +148,20 @@ int run(int argc, char** argv) {
     take_over_start(folder / "weights.pt", &provenance);
   }
   if (!weights.empty()) {
-    Checkpoint before;
-    const NetworkInstance start = load_network(weights, &before);
-    std::vector<std::pair<std::string, torch::Tensor>> parameters;
-    for (const auto& parameter : start.module->named_parameters())
-      parameters.emplace_back(parameter.key(), parameter.value());
-    trainer.start_from(parameters);
-    const std::string seen = before.provenance.count("scans") > 0 ? before.provenance["scans"] : "0";
+    const Checkpoint before = read_checkpoint(weights);
+    if (before.network != config.kind)
+      throw std::invalid_argument(weights + ": holds the network '" + before.network + "', not '" + config.kind + "'");
+    const auto scans = before.provenance.find("scans");
+    const std::string seen = scans == before.provenance.end() ? "0" : scans->second;
+    const std::vector<std::string> left = trainer.start_from(before.parameters, std::stoll(seen));
     provenance[kStartedFrom] = "weights " + before.sha256 + ", after " + seen + " scans";
     provenance[kScansBefore] = seen;
+    if (!left.empty()) {
+      std::string names;
+      for (const std::string& name : left) names += (names.empty() ? "" : ", ") + name;
+      std::cout << weights << " does not have these in the network's shape, they start anew: " << names << std::endl;
+      provenance[kStartedAnew] = names;
+    }
   }
 
   std::signal(SIGTERM, ask_to_stop);

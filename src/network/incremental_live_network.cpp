@@ -195,7 +195,7 @@ NetworkPlaces IncrementalLiveNetwork::place(std::size_t newest, const NetworkInp
       features[static_cast<std::size_t>(row)] =
           network_->encode_placed(kept_[newest].reduced, views({newest}, {T_volume_newest}, volume, voxel_mm));
       ++encoded_;
-      const LiveOutput update = network_->attend_placed(torch::cat(features), input);
+      const LiveOutput update = network_->attend_placed(torch::cat(features), {}, input);
       const torch::Tensor place =
           apply_live_update(input.transforms.slice(0, row, row + 1), update.points.slice(0, row, row + 1), shape);
       T_volume_newest = T_brain_volume.inverse() * pose_from_tensor(place);

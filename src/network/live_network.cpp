@@ -10,6 +10,7 @@
 
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/geometry/anchor_points.h"
+#include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/reconstruction/volume_estimation.h"
 
@@ -64,6 +65,12 @@ torch::Tensor sinusoids(const torch::Tensor& values, const Waves& waves) {
   const torch::Tensor phase = values.unsqueeze(-1) * frequency;
   return torch::cat({phase.sin(), phase.cos()}, -1).flatten(1);
 }
+
+// Weights of staying, and of each pull.
+constexpr std::int64_t kGates = kLivePulls + 1;
+// What a slice hears of its pulls: movements, correlations, and whether they are known.
+constexpr std::int64_t kPullsLength = 9 * kLivePulls + (kLivePulls + 1) + 1;
+constexpr double kLargestPull = 4.;  // kLiveUpdateUnitMm: further ones all look the same
 
 constexpr int kPositionLength = 2 * (9 * kPointWaves.octaves + kIndexWaves.octaves + kStackWaves.octaves +
                                      kCountWaves.octaves + kTimeWaves.octaves) +
@@ -168,7 +175,7 @@ LiveNetwork::LiveNetwork(const LiveNetworkOptions& options) : PoseNetwork("live"
 
   const int first_channels = 1 + kCoordinates;
   const int shared_channels = 1 + kLiveSimulatedChannels + kCoordinates;
-  const int heads_of_first = 9 + 9 + 2, heads_of_shared = 9 + 2;
+  const int heads_of_first = 9 + 9 + 2, heads_of_shared = 9 + kGates + 2;
   first_encoder_ = register_module("first_encoder", LiveEncoder(o, first_channels));
   first_transformer_ = register_module("first_transformer", LiveTransformer(o));
   first_head_ = register_module("first_head", nn::Linear(o.dim, heads_of_first));
@@ -179,9 +186,13 @@ LiveNetwork::LiveNetwork(const LiveNetworkOptions& options) : PoseNetwork("live"
     first_position_ = register_module("first_position", nn::Linear(kPositionLength, o.dim));
     shared_position_ = register_module("shared_position", nn::Linear(kPositionLength, o.dim));
   }
-  // The shared network starts by leaving every slice where it is.
+  if (o.pulls) shared_pulls_ = register_module("shared_pulls", nn::Linear(kPullsLength, o.dim));
+  // The shared network starts by going where the last level of registration does, or, without pulls, by staying.
   nn::init::zeros_(shared_head_->weight);
   nn::init::zeros_(shared_head_->bias);
+  const torch::NoGradGuard no_grad;
+  constexpr float kAlmostAll = 4.F;
+  shared_head_->bias[9 + kGates - 1].fill_(kAlmostAll);
 }
 
 torch::Tensor LiveNetwork::reduce(const torch::Tensor& slices, double resolution_mm) const {
@@ -240,59 +251,70 @@ torch::Tensor LiveNetwork::embed(const NetworkInput& input, bool first) const {
   return linear(position);
 }
 
-LiveOutput LiveNetwork::speak(LiveTransformer& transformer, nn::Linear& head, const torch::Tensor& tokens,
-                              const std::vector<std::int64_t>& lengths, bool first,
-                              std::vector<torch::Tensor>* attention) {
+torch::Tensor LiveNetwork::speak(LiveTransformer& transformer, nn::Linear& head, const torch::Tensor& tokens,
+                                 const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
   const std::int64_t n = tokens.size(0), dim = tokens.size(1);
-  torch::Tensor said;
   if (lengths.size() <= 1) {
     require(lengths.empty() || lengths.front() == n, "lengths do not add up to the number of slices");
-    said = head(transformer->forward(tokens.unsqueeze(0), {}, attention)).squeeze(0);
-  } else {
-    const std::int64_t longest = *std::max_element(lengths.begin(), lengths.end());
-    std::vector<std::int64_t> place;  // of each slice in the padded batch
-    for (std::size_t scan = 0; scan < lengths.size(); ++scan) {
-      for (std::int64_t i = 0; i < lengths[scan]; ++i) place.push_back(static_cast<std::int64_t>(scan) * longest + i);
-    }
-    require(static_cast<std::int64_t>(place.size()) == n, "lengths do not add up to the number of slices");
-    const auto scans = static_cast<std::int64_t>(lengths.size());
-    const torch::Tensor index = torch::tensor(place, torch::kInt64).to(tokens.device());
-    const torch::Tensor padded = torch::zeros({scans * longest, dim}, tokens.options()).index_copy(0, index, tokens);
-    const torch::Tensor mask =
-        torch::zeros({scans * longest}, tokens.options().dtype(torch::kBool)).index_fill(0, index, true);
-    const torch::Tensor result =
-        transformer->forward(padded.view({scans, longest, dim}), mask.view({scans, longest}), attention);
-    said = head(result.reshape({scans * longest, dim}).index_select(0, index));
+    return head(transformer->forward(tokens.unsqueeze(0), {}, attention)).squeeze(0);
   }
-  LiveOutput output;
-  output.points = said.slice(1, 0, 9);
-  if (first) output.mirrored = said.slice(1, 9, 18);
-  output.log_scale = said.select(1, said.size(1) - 2);
-  output.quality = said.select(1, said.size(1) - 1);
-  return output;
+  const std::int64_t longest = *std::max_element(lengths.begin(), lengths.end());
+  std::vector<std::int64_t> place;  // of each slice in the padded batch
+  for (std::size_t scan = 0; scan < lengths.size(); ++scan) {
+    for (std::int64_t i = 0; i < lengths[scan]; ++i) place.push_back(static_cast<std::int64_t>(scan) * longest + i);
+  }
+  require(static_cast<std::int64_t>(place.size()) == n, "lengths do not add up to the number of slices");
+  const auto scans = static_cast<std::int64_t>(lengths.size());
+  const torch::Tensor index = torch::tensor(place, torch::kInt64).to(tokens.device());
+  const torch::Tensor padded = torch::zeros({scans * longest, dim}, tokens.options()).index_copy(0, index, tokens);
+  const torch::Tensor mask =
+      torch::zeros({scans * longest}, tokens.options().dtype(torch::kBool)).index_fill(0, index, true);
+  const torch::Tensor result =
+      transformer->forward(padded.view({scans, longest, dim}), mask.view({scans, longest}), attention);
+  return head(result.reshape({scans * longest, dim}).index_select(0, index));
 }
 
 LiveOutput LiveNetwork::attend(const torch::Tensor& features, const NetworkInput& input,
                                const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
   require_features(features, options_.dim, input);
   const torch::Tensor tokens = options_.positional_embedding ? features + embed(input, true) : features;
-  return speak(first_transformer_, first_head_, tokens, lengths, true, attention);
+  const torch::Tensor said = speak(first_transformer_, first_head_, tokens, lengths, attention);
+  return {said.slice(1, 0, 9), said.slice(1, 9, 18), said.select(1, 18), said.select(1, 19)};
 }
 
 torch::Tensor LiveNetwork::encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated) {
   return shared_encoder_->forward(with_coordinates(normalised(torch::cat({reduced, simulated}, 1))), precision_);
 }
 
-LiveOutput LiveNetwork::attend_placed(const torch::Tensor& features, const NetworkInput& input,
+LiveOutput LiveNetwork::attend_placed(const torch::Tensor& features, const LivePulls& pulls, const NetworkInput& input,
                                       const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
   require_features(features, options_.dim, input);
-  const torch::Tensor tokens = options_.positional_embedding ? features + embed(input, false) : features;
-  return speak(shared_transformer_, shared_head_, tokens, lengths, false, attention);
+  torch::Tensor tokens = options_.positional_embedding ? features + embed(input, false) : features;
+  const bool pulled = options_.pulls && pulls.points.defined();
+  if (options_.pulls) {
+    torch::Tensor heard = torch::zeros({features.size(0), kPullsLength}, features.options());
+    if (pulled) {
+      heard = torch::cat({pulls.points.flatten(1).clamp(-kLargestPull, kLargestPull), pulls.correlation,
+                          torch::ones({features.size(0), 1}, features.options())},
+                         1);
+    }
+    tokens = tokens + shared_pulls_(heard);
+  }
+  const torch::Tensor said = speak(shared_transformer_, shared_head_, tokens, lengths, attention);
+  LiveOutput output;
+  output.points = said.slice(1, 0, 9);
+  if (pulled) {
+    const torch::Tensor share = said.slice(1, 9, 9 + kGates).softmax(1).slice(1, 1, kGates);  // the first gate: stay
+    output.points = output.points + (share.unsqueeze(2) * pulls.points).sum(1);
+  }
+  output.log_scale = said.select(1, 9 + kGates);
+  output.quality = said.select(1, 9 + kGates + 1);
+  return output;
 }
 
-LiveOutput LiveNetwork::update(const torch::Tensor& simulated, const NetworkInput& input,
+LiveOutput LiveNetwork::update(const torch::Tensor& simulated, const LivePulls& pulls, const NetworkInput& input,
                                const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention) {
-  return attend_placed(encode_placed(reduce(input.slices, input.slice_resolution_mm), simulated), input, lengths,
+  return attend_placed(encode_placed(reduce(input.slices, input.slice_resolution_mm), simulated), pulls, input, lengths,
                        attention);
 }
 
@@ -320,7 +342,9 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
               ? simulate_live_channels(reduced, current.transforms, options_, input.thickness_mm, run.formulation)
               : torch::zeros({reduced.size(0), kLiveSimulatedChannels, reduced.size(2), reduced.size(3)},
                              reduced.options());
-      said = update(simulated, current, {}, &attention);
+      LivePulls pulls;
+      if (options_.pulls && options_.volume_conditioned) pulls = pull_live_slices(reduced, current, options_);
+      said = update(simulated, pulls, current, {}, &attention);
       current.transforms = apply_live_update(current.transforms, said.points, options_);
     }
     NetworkStep step;
@@ -407,6 +431,63 @@ torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const Acquisi
                                      const torch::Tensor& volume, double voxel_mm, AcquisitionFormulation formulation) {
   require(volume.defined() && volume.dim() == 3, "the volume must be d x d x d");
   return look(reduced, geometry, volume, volume.size(0), voxel_mm, formulation);
+}
+
+LivePulls pull_live_slices(const torch::Tensor& reduced, const NetworkInput& input, const LiveNetworkOptions& options) {
+  const torch::NoGradGuard no_grad;
+  const torch::Device device = input.transforms.device();
+  const auto n = static_cast<std::size_t>(input.transforms.size(0));
+  require(reduced.dim() == 4 && reduced.size(0) == input.transforms.size(0), "there must be as many slices as poses");
+  RegistrationInput scan;
+  scan.slices = reduced.detach().cpu().contiguous();
+  scan.masks = scan.slices > 0;
+  scan.resolution_mm = options.input_resolution_mm;
+  scan.thickness_mm.assign(n, input.thickness_mm);
+  const torch::Tensor transforms = input.transforms.detach().cpu();
+  const torch::Tensor stacks = input.positions.select(1, 1).cpu().round(), times = input.times.cpu();
+  for (std::size_t i = 0; i < n; ++i) {
+    const auto row = static_cast<std::int64_t>(i);
+    scan.T_world_slice.push_back(pose_from_tensor(transforms[row]));
+    scan.stack.push_back(static_cast<int>(stacks[row].item<float>()));
+    scan.time_s.push_back(times[row].item<float>());
+  }
+  RefinementOptions refinement;
+  refinement.finest_mm = options.input_resolution_mm;
+  const std::vector<std::vector<RefinedSlice>> path = refine_by_level(scan, scan.T_world_slice, refinement);
+
+  const double half_field_mm = 0.5 * options.input_px * options.input_resolution_mm;
+  const AnchorFrame frame = live_anchor_frame(options);
+  const torch::Tensor here = inverse_transform(transforms);
+  const torch::Tensor rest =
+      anchor_points_from_matrix(torch::eye(4).slice(0, 0, 3).unsqueeze(0), frame) / kLiveUpdateUnitMm;
+  std::vector<torch::Tensor> points, correlations;
+  for (const std::vector<RefinedSlice>& level : path) {
+    std::vector<float> correlation;
+    std::vector<Pose> poses;
+    for (const RefinedSlice& slice : level) {
+      correlation.push_back(std::isfinite(slice.ncc) ? static_cast<float>(slice.ncc) : 0.F);
+      poses.push_back(slice.T_brain_slice);
+    }
+    correlations.push_back(torch::tensor(correlation));
+    if (correlations.size() == 1) continue;  // nothing has moved yet
+    // Registration sees relative motion alone: what the whole has drifted by means nothing.
+    const Pose held = fit_planes(poses, scan.T_world_slice, half_field_mm);
+    std::vector<torch::Tensor> places;
+    for (const Pose& pose : poses) places.push_back(tensor_from_pose(held * pose));
+    const torch::Tensor moved = compose_transforms(here, torch::cat(places));
+    points.push_back(anchor_points_from_matrix(moved, frame) / kLiveUpdateUnitMm - rest);
+  }
+  return {torch::stack(points, 1).to(device), torch::stack(correlations, 1).to(device)};
+}
+
+LivePulls concatenate(const std::vector<LivePulls>& pulls) {
+  std::vector<torch::Tensor> points, correlations;
+  for (const LivePulls& each : pulls) {
+    if (!each.points.defined()) return {};
+    points.push_back(each.points);
+    correlations.push_back(each.correlation);
+  }
+  return {torch::cat(points), torch::cat(correlations)};
 }
 
 torch::Tensor apply_live_update(const torch::Tensor& transforms, const torch::Tensor& points,

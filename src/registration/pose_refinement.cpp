@@ -3,6 +3,7 @@
 #include <torch/types.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -66,20 +67,46 @@ class Refiner {
       if (level.passes > 0) run_level(level);
 
     Refinement result;
-    for (std::size_t i = 0; i < slices_.size(); ++i) slices_[i].T_brain_slice = poses_[i];
-    result.slices = std::move(slices_);
+    result.slices = now();
     report_.converged = report_.passes > 0 && report_.last_motion_mm <= options_.convergence_mm;
     result.report = report_;
     return result;
   }
 
- private:
-  void run_level(const LevelPlan& plan) {
-    if (plan.pixel_mm != level_pixel_ || plan.blur_mm != level_blur_) {
-      level_ = make_level(input_, plan.pixel_mm, plan.blur_mm, plan.content);
-      level_pixel_ = plan.pixel_mm;
-      level_blur_ = plan.blur_mm;
+  std::vector<std::vector<RefinedSlice>> run_by_level() {
+    const double middle = std::max(2., options_.finest_mm), coarse = 2. * middle;
+    const std::array<LevelPlan, kRefinementLevels> plan = {{{coarse, 1.5 * coarse, 1, true, SliceContent::outline},
+                                                            {coarse, 1.5 * coarse, 2, false, SliceContent::outline},
+                                                            {middle, 2. * middle, 1, false, SliceContent::outline},
+                                                            {middle, middle, 1, false}}};
+    std::vector<std::vector<RefinedSlice>> path;
+    load_level(plan.front());
+    reconstruct();
+    evaluate();
+    path.push_back(now());
+    for (const LevelPlan& level : plan) {
+      run_level(level);
+      path.push_back(now());
     }
+    return path;
+  }
+
+ private:
+  std::vector<RefinedSlice> now() const {
+    std::vector<RefinedSlice> slices = slices_;
+    for (std::size_t i = 0; i < slices.size(); ++i) slices[i].T_brain_slice = poses_[i];
+    return slices;
+  }
+
+  void load_level(const LevelPlan& plan) {
+    if (plan.pixel_mm == level_pixel_ && plan.blur_mm == level_blur_) return;
+    level_ = make_level(input_, plan.pixel_mm, plan.blur_mm, plan.content);
+    level_pixel_ = plan.pixel_mm;
+    level_blur_ = plan.blur_mm;
+  }
+
+  void run_level(const LevelPlan& plan) {
+    load_level(plan);
     for (int pass = 0; pass < plan.passes; ++pass) {
       reconstruct();
       constexpr int kStackSteps = 4, kTrajectorySteps = 3;
@@ -289,15 +316,30 @@ void validate(const RefinementOptions& options) {
   require(options.trajectory_passes >= 0, "trajectory_passes", options.trajectory_passes, "zero or positive");
 }
 
-Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
-                        const RefinementOptions& options, RefinementEffort effort) {
+namespace {
+
+void validate(const RegistrationInput& input, const std::vector<Pose>& start, const RefinementOptions& options) {
   validate(input);
   validate(options);
   if (start.size() != input.count())
     throw std::invalid_argument("registration: " + std::to_string(start.size()) + " start poses for " +
                                 std::to_string(input.count()) + " slices");
+}
+
+}  // namespace
+
+Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
+                        const RefinementOptions& options, RefinementEffort effort) {
+  validate(input, start, options);
   const torch::NoGradGuard no_grad;
   return Refiner(input, start, options).run(effort);
+}
+
+std::vector<std::vector<RefinedSlice>> refine_by_level(const RegistrationInput& input, const std::vector<Pose>& start,
+                                                       const RefinementOptions& options) {
+  validate(input, start, options);
+  const torch::NoGradGuard no_grad;
+  return Refiner(input, start, options).run_by_level();
 }
 
 torch::Tensor reconstruct_weighted(const RegistrationInput& input, const std::vector<Pose>& poses,

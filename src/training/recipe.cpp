@@ -13,7 +13,7 @@ namespace svort {
 namespace {
 
 // What random numbers are drawn for, so that a change in one place leaves the others as they were.
-enum Purpose : std::uint64_t { kWhichNetwork = 101, kWhichIteration = 102, kWarmStart = 103 };
+enum Purpose : std::uint64_t { kWhichNetwork = 101, kWhichIteration = 102, kWarmStart = 103, kPullsUnknown = 104 };
 
 constexpr double kRadians = M_PI / 180.;
 
@@ -91,6 +91,7 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
   require(share(options.first_share), "first_share", "0 to 1");
   require(share(options.unmoved_share), "unmoved_share", "0 to 1");
   require(share(options.second_update_share), "second_update_share", "0 to 1");
+  require(share(options.pulls_unknown_share), "pulls_unknown_share", "0 to 1");
   require(options.beta > 0. && std::isfinite(options.beta), "beta", "positive");
   require(size(options.mirror_weight), "mirror_weight", "zero or positive");
   require(size(options.scale_weight), "scale_weight", "zero or positive");
@@ -164,24 +165,31 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   std::vector<torch::Tensor> starts;
   for (std::size_t i = 0; i < scans.size(); ++i) starts.push_back(warm_start(scans[i], step, i));
   input.transforms = torch::cat(starts);
-  const auto look = [&] {
-    if (!shape.volume_conditioned) {
-      return torch::zeros({truth.size(0), kLiveSimulatedChannels, shape.input_px, shape.input_px}, truth.options());
-    }
-    std::vector<torch::Tensor> views;
+  const bool pulled = shape.pulls && shape.volume_conditioned &&
+                      !RandomStream(seed_, step, kPullsUnknown).chance(options_.pulls_unknown_share);
+  const auto update = [&] {
+    torch::Tensor simulated =
+        torch::zeros({truth.size(0), kLiveSimulatedChannels, shape.input_px, shape.input_px}, truth.options());
+    std::vector<LivePulls> pulls;
     std::int64_t begin = 0;
     for (const SimulatedScan& scan : scans) {
       const std::int64_t n = scan.truth.size(0);
-      views.push_back(simulate_live_channels(network_->reduce(scan.input.slices, scan.input.slice_resolution_mm),
-                                             input.transforms.narrow(0, begin, n), shape, scan.input.thickness_mm,
-                                             AcquisitionFormulation::fast));
+      NetworkInput current = scan.input;
+      current.transforms = input.transforms.narrow(0, begin, n);
+      const torch::Tensor reduced = network_->reduce(scan.input.slices, scan.input.slice_resolution_mm);
+      if (shape.volume_conditioned) {
+        simulated.narrow(0, begin, n)
+            .copy_(simulate_live_channels(reduced, current.transforms, shape, scan.input.thickness_mm,
+                                          AcquisitionFormulation::fast));
+      }
+      pulls.push_back(pulled ? pull_live_slices(reduced, current, shape) : LivePulls());
       begin += n;
     }
-    return torch::cat(views);
+    return network_->update(simulated, concatenate(pulls), input, lengths);
   };
   if (RandomStream(seed_, step, kWhichIteration).chance(options_.second_update_share)) {
     const torch::NoGradGuard no_grad;
-    input.transforms = apply_live_update(input.transforms, network_->update(look(), input, lengths).points, shape);
+    input.transforms = apply_live_update(input.transforms, update().points, shape);
   }
   const AnchorFrame frame = live_anchor_frame(shape);
   const torch::Tensor rest =
@@ -189,7 +197,7 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   const torch::Tensor target =
       (anchor_points_from_matrix(compose_transforms(inverse_transform(input.transforms), truth), frame) - rest) /
       kLiveUpdateUnitMm;
-  const LiveOutput said = network_->update(look(), input, lengths);
+  const LiveOutput said = update();
   const torch::Tensor points = smooth_l1_loss(said.points, target, options_.beta);
   const torch::Tensor error = (said.points - target).detach().view({-1, 3, 3}).norm(2, 2).mean(1);
   StepLoss loss =

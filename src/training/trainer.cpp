@@ -129,7 +129,7 @@ double Trainer::learning_rate(std::int64_t step) const {
 std::vector<SimulatedScan> Trainer::simulate(std::int64_t step) const {
   at::set_num_threads(options_.threads);  // of this thread: it may be the one that works ahead
   const auto turn = static_cast<std::size_t>(step) % training_.size();
-  const auto first = static_cast<std::uint64_t>(step) * static_cast<std::uint64_t>(options_.scans_per_step);
+  const auto first = static_cast<std::uint64_t>(first_scan_ + step * options_.scans_per_step);
   std::vector<SimulatedScan> scans = training_[turn]->simulate(first, options_.scans_per_step);
   scans.erase(std::remove_if(scans.begin(), scans.end(), [](const auto& scan) { return scan.truth.size(0) == 0; }),
               scans.end());
@@ -165,7 +165,7 @@ std::map<std::string, double> Trainer::step() {
     const auto first = scans.begin() + static_cast<std::ptrdiff_t>(begin);
     const double share = static_cast<double>(count) / static_cast<double>(scans.size());
     const StepLoss loss =
-        recipe_->loss({first, first + static_cast<std::ptrdiff_t>(count)}, static_cast<std::uint64_t>(number));
+        recipe_->loss({first, first + static_cast<std::ptrdiff_t>(count)}, static_cast<std::uint64_t>(first_scan_ + number));
     usable = std::isfinite(loss.total.item<double>());
     if (usable) (loss.total * share).backward();
     for (const auto& [name, value] : loss.parts) parts[name] += share * value;
@@ -211,20 +211,28 @@ std::vector<std::pair<std::string, torch::Tensor>> Trainer::averaged() const {
   return result;
 }
 
-void Trainer::start_from(const std::vector<std::pair<std::string, torch::Tensor>>& parameters) {
+std::vector<std::string> Trainer::start_from(const std::map<std::string, torch::Tensor>& parameters,
+                                             std::int64_t first_scan) {
   const torch::NoGradGuard no_grad;
-  auto named = recipe_->network().named_parameters();
-  if (named.size() != parameters.size())
-    throw std::runtime_error("start_from: the weights have " + std::to_string(parameters.size()) +
-                             " parameters, the network " + std::to_string(named.size()));
-  for (const auto& [name, value] : parameters) {
-    torch::Tensor* own = named.find(name);
-    if (own == nullptr || own->sizes() != value.sizes())
-      throw std::runtime_error("start_from: the network has no parameter '" + name + "' of that shape");
-    own->copy_(value);
+  require(first_scan >= 0, "start_from: the first scan's number must be zero or positive");
+  std::vector<std::string> left;
+  std::size_t taken = 0;
+  for (auto& own : recipe_->network().named_parameters()) {
+    const auto given = parameters.find(own.key());
+    if (given == parameters.end() || given->second.sizes() != own.value().sizes()) {
+      left.push_back(own.key());
+      continue;
+    }
+    if (!torch::isfinite(given->second).all().item<bool>())
+      throw std::runtime_error("start_from: NaN or infinity in " + own.key());
+    own.value().copy_(given->second);
+    ++taken;
   }
+  if (taken == 0) throw std::runtime_error("start_from: the weights have no parameter of this network");
   average_.clear();
   for (const torch::Tensor& parameter : recipe_->network().parameters()) average_.push_back(parameter.detach().clone());
+  first_scan_ = first_scan;
+  return left;
 }
 
 void Trainer::save() const {
@@ -238,7 +246,8 @@ void Trainer::save() const {
   archive.write("optimizer", optimizer);
   for (std::size_t i = 0; i < average_.size(); ++i) archive.write("average_" + std::to_string(i), average_[i]);
   archive.write("counters",
-                torch::tensor({progress_.step, progress_.scans, progress_.skipped, options_.seed}, torch::kInt64));
+                torch::tensor({progress_.step, progress_.scans, progress_.skipped, options_.seed, first_scan_},
+                              torch::kInt64));
   archive.write("seconds", torch::tensor({progress_.seconds}, torch::kFloat64));
   archive.save_to(temporary.string());
   std::filesystem::rename(temporary, path);
@@ -265,6 +274,7 @@ void Trainer::resume() {
     progress_.step = counters[0].item<std::int64_t>();
     progress_.scans = counters[1].item<std::int64_t>();
     progress_.skipped = counters[2].item<std::int64_t>();
+    first_scan_ = counters[4].item<std::int64_t>();
     progress_.seconds = seconds[0].item<double>();
   } catch (const c10::Error& error) {
     throw std::runtime_error(path.string() + ": is not the state of this network: " + error.what_without_backtrace());

@@ -6,8 +6,10 @@
 #include <cmath>
 #include <string>
 
+#include "registration/registration_fixture.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/metrics/pose_error.h"
 
 namespace {
 
@@ -41,6 +43,37 @@ NetworkInput random_input(std::int64_t n, std::uint64_t seed = 1) {
   input.times = index.to(torch::kFloat32) * 1.2;
   input.slice_resolution_mm = 2.;
   return input;
+}
+
+svort::LivePulls random_pulls(std::int64_t n) {
+  return {0.3 * torch::randn({n, svort::kLivePulls, 9}), torch::rand({n, svort::kLivePulls + 1})};
+}
+
+// A moving head of test/registration, as a network sees it; truth is in the frame of the prescription.
+struct MovingHead {
+  NetworkInput input;
+  torch::Tensor truth;
+};
+MovingHead moving_head() {
+  const svort_test::SimulatedScan scan = svort_test::simulated_scan({});
+  MovingHead result;
+  std::vector<torch::Tensor> nominal, truth;
+  std::vector<float> stack, time;
+  for (std::size_t i = 0; i < scan.truth.size(); ++i) {
+    nominal.push_back(svort::tensor_from_pose(scan.input.T_world_slice[i]));
+    truth.push_back(svort::tensor_from_pose(scan.truth[i]));
+    stack.push_back(static_cast<float>(scan.input.stack[i]));
+    time.push_back(static_cast<float>(scan.input.time_s[i]));
+  }
+  const auto n = static_cast<std::int64_t>(scan.truth.size());
+  result.input.slices = scan.input.slices;
+  result.input.transforms = torch::cat(nominal);
+  result.input.positions = torch::stack({torch::zeros({n}), torch::tensor(stack)}, 1);
+  result.input.slice_counts = torch::full({n}, 16, torch::kInt64);
+  result.input.times = torch::tensor(time);
+  result.input.slice_resolution_mm = 2.;
+  result.truth = torch::cat(truth);
+  return result;
 }
 
 NetworkInput rows(const NetworkInput& input, const torch::Tensor& index) {
@@ -155,7 +188,8 @@ TEST(LiveNetwork, GradientsReachEveryParameter) {
   randomise(network);
   const NetworkInput input = random_input(6);
   const auto first = network.attend(network.encode(input.slices, 2.), input);
-  const auto shared = network.update(torch::rand({6, svort::kLiveSimulatedChannels, 64, 64}), input);
+  const auto shared =
+      network.update(torch::rand({6, svort::kLiveSimulatedChannels, 64, 64}), random_pulls(6), input);
   (first.points.square().sum() + first.mirrored.square().sum() + first.log_scale.square().sum() +
    first.quality.square().sum() + shared.points.square().sum() + shared.log_scale.square().sum() +
    shared.quality.square().sum())
@@ -233,6 +267,12 @@ TEST(LiveNetwork, AblationsAreWhatTheirNamesSay) {
   run.iterations = 2;
   EXPECT_FALSE(torch::allclose(blind.run(input, {{32, 32, 32}, 4.}, run)[1].points,
                                with_position.run(input, {{32, 32, 32}, 4.}, run)[1].points));
+  options = small();
+  options.pulls = false;
+  LiveNetwork unpulled(options);
+  EXPECT_FALSE(unpulled.named_parameters().contains("shared_pulls.weight"));
+  const auto untrained = unpulled.run(input, {{32, 32, 32}, 4.}, run);
+  EXPECT_TRUE(torch::allclose(untrained[0].points, untrained[1].points, 1e-4, 1e-3)) << "without pulls it stays";
 }
 
 TEST(LiveNetwork, AnUpdateThatNamesTheWayToTheTruthGoesThere) {
@@ -248,6 +288,54 @@ TEST(LiveNetwork, AnUpdateThatNamesTheWayToTheTruthGoesThere) {
       svort::kLiveUpdateUnitMm;
   EXPECT_TRUE(torch::allclose(svort::apply_live_update(here, way, options), truth, 1e-4, 1e-3));
   EXPECT_TRUE(torch::allclose(svort::apply_live_update(here, torch::zeros({6, 9}), options), here, 1e-4, 1e-3));
+}
+
+TEST(LiveNetwork, AnUntrainedUpdateGoesWhereImagesPull) {
+  const torch::NoGradGuard no_grad;
+  const MovingHead head = moving_head();
+  LiveNetwork network;
+  const torch::Tensor reduced = network.reduce(head.input.slices, 2.);
+  const svort::LivePulls pulls = svort::pull_live_slices(reduced, head.input, network.options());
+  const std::int64_t n = head.truth.size(0);
+  ASSERT_EQ(pulls.points.sizes(), (std::vector<std::int64_t>{n, svort::kLivePulls, 9}));
+  ASSERT_EQ(pulls.correlation.sizes(), (std::vector<std::int64_t>{n, svort::kLivePulls + 1}));
+  EXPECT_GT(pulls.correlation.slice(1, svort::kLivePulls).mean().item<float>(),
+            pulls.correlation.slice(1, 0, 1).mean().item<float>());
+  const svort::AnchorFrame frame = svort::live_anchor_frame(network.options());
+  const auto error = [&](const torch::Tensor& transforms) {
+    return svort::relative_pose_errors(transforms, head.truth, frame).ed.mean().item<double>();
+  };
+  const torch::Tensor views = svort::simulate_live_channels(reduced, head.input.transforms, network.options(), 3.,
+                                                            svort::AcquisitionFormulation::fast);
+  const auto after = [&](const svort::LivePulls& told) {
+    return error(svort::apply_live_update(head.input.transforms, network.update(views, told, head.input).points,
+                                          network.options()));
+  };
+  const double before = error(head.input.transforms);
+  EXPECT_GT(before, 1.);
+  EXPECT_LT(after(pulls), 0.6 * before);
+  EXPECT_NEAR(after({}), before, 1e-3) << "not told of pulls, it stays";
+  // What the whole has drifted by is taken out.
+  const torch::Tensor moved = svort::apply_live_update(
+      head.input.transforms, pulls.points.select(1, svort::kLivePulls - 1), network.options());
+  const auto centre = [](const torch::Tensor& transforms) {
+    return svort::transform_points(transforms, torch::zeros({transforms.size(0), 3})).mean(0);
+  };
+  EXPECT_LT((centre(moved) - centre(head.input.transforms)).norm().item<float>(), 0.5F);
+}
+
+TEST(LiveNetwork, PullsDoNotDependOnTheFrame) {
+  const torch::NoGradGuard no_grad;
+  MovingHead head = moving_head();
+  const LiveNetwork network;
+  const torch::Tensor reduced = network.reduce(head.input.slices, 2.);
+  const svort::LivePulls here = svort::pull_live_slices(reduced, head.input, network.options());
+  const torch::Tensor turn = svort::axisangle_to_matrix(torch::tensor({{0.9F, -0.4F, 1.2F, 1.F, 2.F, -1.F}}));
+  head.input.transforms = svort::compose_transforms(turn.expand_as(head.input.transforms), head.input.transforms);
+  const svort::LivePulls turned = svort::pull_live_slices(reduced, head.input, network.options());
+  // The grid of voxels lies elsewhere in the brain: 10 mm is 1.
+  EXPECT_LT((turned.points - here.points).abs().mean().item<float>(), 0.03F);
+  EXPECT_GT(here.points.abs().mean().item<float>(), 0.03F);
 }
 
 TEST(LiveNetwork, SimulatedChannelsShowTheVolumeAndItsSlopeAlongTheNormal) {

@@ -360,5 +360,23 @@ TEST(Blurred, IsTheSameWhereverTheHeadLiesInItsCube) {
   }
 }
 
+TEST(RefineByLevel, EachLevelComesCloserAndTheFirstEntryIsTheStart) {
+  const SimulatedScan scan = simulated_scan({});
+  const std::vector<Pose>& start = scan.input.T_world_slice;
+  const auto path = refine_by_level(scan.input, start, quick_options());
+  ASSERT_EQ(path.size(), kRefinementLevels + 1);
+  const auto error = [&](const std::vector<RefinedSlice>& slices) {
+    return relative_error_mm(poses_of({slices, {}}), scan.truth);
+  };
+  for (std::size_t i = 0; i < start.size(); ++i) {
+    EXPECT_EQ(path[0][i].T_brain_slice.matrix(), start[i].matrix());
+    EXPECT_TRUE(std::isfinite(path[0][i].ncc));
+  }
+  EXPECT_LT(error(path[2]), error(path[0]));
+  EXPECT_LT(error(path[4]), error(path[2]));
+  EXPECT_LT(error(path[4]), 0.6 * error(path[0]));
+  EXPECT_THROW(refine_by_level(scan.input, {}, quick_options()), std::invalid_argument);
+}
+
 }  // namespace
 }  // namespace svort

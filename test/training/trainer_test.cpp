@@ -377,6 +377,42 @@ TEST_F(TrainerTest, ValidationMeasuresTheNetworksSteps) {
   EXPECT_LE(result.gd_rad[0], M_PI);
 }
 
+TEST_F(TrainerTest, StartsFromWeightsOfANetworkThatHasChangedSinceAndGoesOnWithOtherScans) {
+  const auto start = recipe();
+  std::map<std::string, torch::Tensor> weights;
+  for (const auto& parameter : start->network().named_parameters())
+    weights[parameter.key()] = parameter.value().detach() + 1.;
+  weights.erase("shared_pulls.weight");
+  weights["shared_head.bias"] = torch::zeros({3});
+  Trainer trainer(recipe(1.), {simulator()}, nullptr, quick(), folder_);
+  const auto random = trainer.averaged();
+  EXPECT_EQ(trainer.start_from(weights, 100), (std::vector<std::string>{"shared_head.bias", "shared_pulls.weight"}));
+  const auto taken = trainer.averaged();
+  for (std::size_t i = 0; i < taken.size(); ++i) {
+    const bool anew = taken[i].first == "shared_head.bias" || taken[i].first == "shared_pulls.weight";
+    EXPECT_TRUE(torch::equal(taken[i].second, anew ? random[i].second : weights[taken[i].first])) << taken[i].first;
+  }
+  // Scan 100 and the next are what it learns from, also after it has been stopped.
+  Trainer same(recipe(1.), {simulator()}, nullptr, quick(), folder_ / "same");
+  same.start_from(weights, 100);
+  Trainer from_the_first(recipe(1.), {simulator()}, nullptr, quick(), folder_ / "first");
+  from_the_first.start_from(weights, 0);
+  same.step();
+  same.save();
+  Trainer resumed(recipe(1.), {simulator()}, nullptr, quick(), folder_ / "same");
+  resumed.resume();
+  resumed.step();
+  for (int i = 0; i < 2; ++i) {
+    trainer.step();
+    from_the_first.step();
+  }
+  EXPECT_TRUE(same_weights(resumed, trainer));
+  EXPECT_FALSE(same_weights(from_the_first, trainer));
+  weights["first_head.bias"].fill_(std::numeric_limits<float>::quiet_NaN());
+  EXPECT_THROW(trainer.start_from(weights), std::runtime_error);
+  EXPECT_THROW(trainer.start_from({{"another", torch::zeros({2})}}), std::runtime_error);
+}
+
 TEST_F(TrainerTest, RejectsWhatDoesNotFit) {
   EXPECT_THROW(Trainer(recipe(), {}, nullptr, quick(), folder_), std::invalid_argument);
   TrainerOptions options = quick();

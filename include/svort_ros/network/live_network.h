@@ -11,6 +11,7 @@
 
 #include "svort_ros/network/pose_consensus.h"
 #include "svort_ros/network/pose_network.h"
+#include "svort_ros/registration/pose_refinement.h"
 
 namespace svort {
 
@@ -27,6 +28,7 @@ struct LiveNetworkOptions {
   int iterations = 3;               ///< K: the first network once, then the volume-conditioned network K - 1 times
   bool positional_embedding = true;  ///< false: ablation, tokens carry the image alone
   bool volume_conditioned = true;    ///< false: ablation "w/o Vol", later iterations see the slice alone
+  bool pulls = true;  ///< the shared network is told where registration would take the slices, see LivePulls
   ConsensusOptions consensus;
 
   template <class Visitor>
@@ -42,6 +44,7 @@ struct LiveNetworkOptions {
     v("iterations", iterations, "transformation updates (K of the paper); may be changed after training");
     v("positional_embedding", positional_embedding, "false: without positional embedding (ablation)");
     v("volume_conditioned", volume_conditioned, "false: later updates do not see the volume (ablation)");
+    v("pulls", pulls, "later updates are told where registration would take the slices");
     v.section("consensus", consensus);
   }
 };
@@ -99,13 +102,25 @@ struct LiveOutput {
   torch::Tensor quality;    ///< n: logit of the slice's weight
 };
 
+/// Levels of blur at which images pull slices.
+constexpr std::int64_t kLivePulls = static_cast<std::int64_t>(kRefinementLevels);
+
+/// Where registration to the volume that the slices form would take each of n slices (refine_by_level()). The shared
+/// network weighs these against each other and against staying, slice by slice.
+struct LivePulls {
+  torch::Tensor points;       ///< n x kLivePulls x 9: how each anchor point would have moved after each level, in the
+                              ///< axes of the slice as it lies now, units of kLiveUpdateUnitMm
+  torch::Tensor correlation;  ///< n x (kLivePulls + 1): of slice and volume, before and after each level
+};
+
 /// The network for live use: every slice is encoded once, whatever comes after it.
 ///
 /// The first network estimates the anchor points of each slice from the image and from where all slices were
 /// prescribed; pose_consensus() turns that into one head pose. The second, shared by all later iterations, sees each
-/// slice beside the slice simulated from the volume at its current place, and moves it. Both normalise each slice on
-/// its own (group norm), so encode() of a slice never changes; attend() runs over all slices that are there, 1 to 450
-/// of them, any prefix of a scan.
+/// slice beside the slice simulated from the volume at its current place, hears where images pull it, and moves it: by
+/// a mean of the pulls with weights that it chooses, and a correction of its own. Both normalise each slice on its own
+/// (group norm), so encode() of a slice never changes; attend() runs over all slices that are there, 1 to 450 of them,
+/// any prefix of a scan.
 class LiveNetwork : public PoseNetwork {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -132,7 +147,8 @@ class LiveNetwork : public PoseNetwork {
 
   /// Shared network: one update. `input.transforms` are the current places in the brain frame.
   /// @param simulated n x kLiveSimulatedChannels x input_px x input_px, see simulate_live_channels()
-  LiveOutput update(const torch::Tensor& simulated, const NetworkInput& input,
+  /// @param pulls     see pull_live_slices(); undefined: not known
+  LiveOutput update(const torch::Tensor& simulated, const LivePulls& pulls, const NetworkInput& input,
                     const std::vector<std::int64_t>& lengths = {}, std::vector<torch::Tensor>* attention = nullptr);
 
   /// update() in two steps, so that features may be kept. Features of slices at their places, for the shared network;
@@ -142,7 +158,7 @@ class LiveNetwork : public PoseNetwork {
   /// @return n x dim
   torch::Tensor encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated);
   /// Shared network: all slices together. @param features n x dim, from encode_placed(); the rest as for update()
-  LiveOutput attend_placed(const torch::Tensor& features, const NetworkInput& input,
+  LiveOutput attend_placed(const torch::Tensor& features, const LivePulls& pulls, const NetworkInput& input,
                            const std::vector<std::int64_t>& lengths = {},
                            std::vector<torch::Tensor>* attention = nullptr);
 
@@ -154,14 +170,15 @@ class LiveNetwork : public PoseNetwork {
  private:
   torch::Tensor embed(const NetworkInput& input, bool first) const;
   torch::Tensor with_coordinates(const torch::Tensor& images) const;
-  LiveOutput speak(LiveTransformer& transformer, torch::nn::Linear& head, const torch::Tensor& tokens,
-                   const std::vector<std::int64_t>& lengths, bool first, std::vector<torch::Tensor>* attention);
+  torch::Tensor speak(LiveTransformer& transformer, torch::nn::Linear& head, const torch::Tensor& tokens,
+                      const std::vector<std::int64_t>& lengths, std::vector<torch::Tensor>* attention);
 
   LiveNetworkOptions options_;
   torch::ScalarType precision_ = torch::kFloat32;
   LiveEncoder first_encoder_{nullptr}, shared_encoder_{nullptr};
   LiveTransformer first_transformer_{nullptr}, shared_transformer_{nullptr};
   torch::nn::Linear first_position_{nullptr}, shared_position_{nullptr}, first_head_{nullptr}, shared_head_{nullptr};
+  torch::nn::Linear shared_pulls_{nullptr};
 };
 
 /// Channels that the shared network gets beside the slice: the volume seen from the slice's place, and how that changes
@@ -184,6 +201,14 @@ constexpr double kLiveNormalStepMm = 3.;
 /// @param voxel_mm its voxel size
 torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const AcquisitionGeometry& geometry,
                                      const torch::Tensor& volume, double voxel_mm, AcquisitionFormulation formulation);
+
+/// Where images pull the slices of one scan from `input.transforms`. No gradients, on the CPU.
+/// @param reduced n x 1 x p x p, LiveNetwork::reduce(), in acquisition order
+/// @param input   transforms, positions, times, common_frame and thickness_mm are used
+LivePulls pull_live_slices(const torch::Tensor& reduced, const NetworkInput& input, const LiveNetworkOptions& options);
+
+/// Pulls of several scans, one after another. Undefined if one of them is.
+LivePulls concatenate(const std::vector<LivePulls>& pulls);
 
 /// Places after an update of the shared network.
 /// @param transforms n x 3 x 4, current places; @param points n x 9, LiveOutput::points of update()

@@ -91,6 +91,18 @@ struct Refinement {
 Refinement refine_poses(const RegistrationInput& input, const std::vector<Pose>& start,
                         const RefinementOptions& options = {}, RefinementEffort effort = RefinementEffort::full);
 
+/// Levels of refine_by_level(): stacks, then slices blurred by 6, 4 and 2 mm.
+constexpr std::size_t kRefinementLevels = 4;
+
+/// One short run of refine_poses(), coarse to fine, and where it stands after each level: where images pull slices, for
+/// whoever decides how far to follow them. 2 mm pixels, or RefinementOptions::finest_mm if that is coarser.
+///
+/// @return kRefinementLevels + 1 entries of one RefinedSlice per slice. The first is `start` itself, with the
+///         correlations that it has at the coarsest level; sigma_mm is not set
+/// @throws std::invalid_argument naming what does not fit
+std::vector<std::vector<RefinedSlice>> refine_by_level(const RegistrationInput& input, const std::vector<Pose>& start,
+                                                       const RefinementOptions& options = {});
+
 /// @throws std::invalid_argument naming the option that is out of range
 void validate(const RefinementOptions& options);
 

@@ -48,7 +48,8 @@ struct LiveRecipeOptions {
   double perturb_mm = 6.;            ///< displacement of perturbed slices, per axis, at most, mm
   double global_deg = 6.;            ///< rotation of the whole start, per axis, degrees
   double global_mm = 3.;             ///< displacement of the whole start, per axis, mm
-  double second_update_share = 0.3;  ///< share of steps that make one update without gradient before the one with
+  double second_update_share = 0.4;  ///< share of steps that make one update without gradient before the one with
+  double pulls_unknown_share = 0.1;  ///< share of steps in which the shared network is not told of pulls
 
   template <class Visitor>
   void visit(Visitor&& v) {
@@ -64,6 +65,7 @@ struct LiveRecipeOptions {
     v("global_deg", global_deg, "rotation of the whole start, standard deviation per axis, degrees");
     v("global_mm", global_mm, "displacement of the whole start, standard deviation per axis, mm");
     v("second_update_share", second_update_share, "share of steps with one update before the one that has a gradient");
+    v("pulls_unknown_share", pulls_unknown_share, "share of steps in which the shared network is not told of pulls");
   }
 };
 

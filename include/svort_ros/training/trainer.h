@@ -100,8 +100,13 @@ class Trainer {
   /// Continues from state.pt in the folder. Rows of the logs beyond it are removed.
   /// @throws std::runtime_error naming the file and what is wrong with it
   void resume();
-  /// Starts from these weights instead of random ones; the average too.
-  void start_from(const std::vector<std::pair<std::string, torch::Tensor>>& parameters);
+  /// Starts from these weights instead of random ones; the average too. Parameters that the weights do not have in the
+  /// network's shape, because the network has changed since, stay random.
+  /// @param first_scan number of the first scan: those that the weights have seen need not come again
+  /// @return names of the parameters that stay random
+  /// @throws std::runtime_error if none fits, or naming one that is not finite
+  std::vector<std::string> start_from(const std::map<std::string, torch::Tensor>& parameters,
+                                      std::int64_t first_scan = 0);
 
   struct Hooks {
     std::function<bool()> stop;                               ///< asked before every step
@@ -138,6 +143,7 @@ class Trainer {
   torch::optim::AdamW optimizer_;
   std::vector<torch::Tensor> average_;
   TrainingProgress progress_;
+  std::int64_t first_scan_ = 0;  ///< number of step 0's first scan
   std::future<std::vector<SimulatedScan>> next_;
   std::int64_t next_step_ = -1;  ///< that next_ is for
 };
