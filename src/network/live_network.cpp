@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <string>
 
+#include "../registration/rotation_grid.h"
 #include "svort_ros/acquisition/point_spread_function.h"
 #include "svort_ros/geometry/anchor_points.h"
 #include "svort_ros/geometry/rigid_fit.h"
@@ -282,6 +283,55 @@ LiveOutput LiveNetwork::attend(const torch::Tensor& features, const NetworkInput
   return {said.slice(1, 0, 9), said.slice(1, 9, 18), said.select(1, 18), said.select(1, 19)};
 }
 
+PoseVotes LiveNetwork::vote(const torch::Tensor& features, const NetworkInput& input,
+                            std::vector<torch::Tensor>* attention) {
+  const torch::NoGradGuard no_grad;
+  require_features(features, options_.dim, input);
+  const std::int64_t n = features.size(0);
+  const int views = options_.consensus.views;
+  require(views >= 1 && views <= 100, "consensus.views must be 1 to 100");
+  const auto repeated = [views](const torch::Tensor& tensor) {
+    return torch::cat(std::vector<torch::Tensor>(static_cast<std::size_t>(views), tensor));
+  };
+  NetworkInput shown = input;
+  shown.slices = torch::Tensor();
+  shown.positions = repeated(input.positions);
+  shown.slice_counts = repeated(input.slice_counts);
+  shown.times = repeated(input.times);
+  std::vector<torch::Tensor> turned = {input.transforms};
+  if (views > 1) {
+    for (const Eigen::Quaterniond& rotation : spread_rotations(views - 1)) {
+      const torch::Tensor turn = tensor_from_pose(Pose(rotation)).to(input.transforms.device());
+      turned.push_back(compose_transforms(turn.expand({n, 3, 4}), input.transforms));
+    }
+  }
+  shown.transforms = torch::cat(turned);
+  std::vector<torch::Tensor> looks;
+  const LiveOutput said =
+      attend(repeated(features), shown, std::vector<std::int64_t>(static_cast<std::size_t>(views), n),
+             attention != nullptr ? &looks : nullptr);
+  for (const torch::Tensor& look : looks) attention->push_back(look.slice(0, 0, 1));
+  PoseVotes votes = live_votes(said, shown, options_);
+  votes.nominal = repeated(input.transforms.detach().cpu());  // as they lie, not as they were shown
+  return votes;
+}
+
+torch::Tensor LiveNetwork::place(const torch::Tensor& features, const NetworkInput& input,
+                                 std::vector<torch::Tensor>* attention) {
+  const PoseVotes votes = vote(features, input, attention);
+  const torch::Tensor still = pose_consensus(votes, options_.consensus).slice(0, 0, features.size(0));
+  const torch::Tensor moving = trajectory_consensus(votes, still, options_.consensus);
+  return compose_transforms(moving.to(input.transforms.device()), input.transforms);
+}
+
+LiveFrame LiveNetwork::find_frame(const torch::Tensor& features, const NetworkInput& placed) {
+  NetworkInput input = placed;
+  input.common_frame = true;
+  const PoseVotes votes = vote(features, input);
+  const torch::Tensor motions = pose_consensus(votes, options_.consensus);
+  return {motions.slice(0, 0, 1).clone(), vote_agreement(votes, motions, options_.consensus)};
+}
+
 torch::Tensor LiveNetwork::encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated) {
   return shared_encoder_->forward(with_coordinates(normalised(torch::cat({reduced, simulated}, 1))), precision_);
 }
@@ -325,16 +375,15 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
   const AnchorFrame frame = {static_cast<int>(input.slices.size(3)), static_cast<int>(input.slices.size(2)),
                              input.slice_resolution_mm};
   const torch::Tensor reduced = reduce(input.slices, input.slice_resolution_mm);
+  const torch::Tensor features = encode(input.slices, input.slice_resolution_mm);
   NetworkInput current = input;
   std::vector<NetworkStep> steps;
   for (int k = 0; k < iterations; ++k) {
-    LiveOutput said;
     std::vector<torch::Tensor> attention;
+    NetworkStep step;
     if (k == 0) {
-      said = attend(encode(input.slices, input.slice_resolution_mm), input, {}, &attention);
-      current.transforms = compose_transforms(
-          pose_consensus(live_votes(said, input, options_), options_.consensus).to(input.transforms.device()),
-          input.transforms);
+      current.transforms = place(features, input, &attention);
+      step.weights = torch::sigmoid(attend(features, input).quality);
     } else {
       // Ablation "w/o Vol": the later iterations see the slice alone.
       const torch::Tensor simulated =
@@ -344,13 +393,14 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
                              reduced.options());
       LivePulls pulls;
       if (options_.pulls && options_.volume_conditioned) pulls = pull_live_slices(reduced, current, options_);
-      said = update(simulated, pulls, current, {}, &attention);
+      const LiveOutput said = update(simulated, pulls, current, {}, &attention);
       current.transforms = apply_live_update(current.transforms, said.points, options_);
+      const torch::Tensor motion = find_frame(features, current).motion.to(current.transforms.device());
+      current.transforms = compose_transforms(motion.expand_as(current.transforms), current.transforms);
+      step.weights = torch::sigmoid(said.quality);
     }
-    NetworkStep step;
     step.transforms = current.transforms;
     step.points = anchor_points_from_matrix(current.transforms, frame);
-    step.weights = torch::sigmoid(said.quality);
     step.attention = attention.back().squeeze(0);
     steps.push_back(step);
   }

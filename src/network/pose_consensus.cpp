@@ -7,11 +7,13 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <map>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
+#include "../registration/trajectory.h"
 #include "svort_ros/geometry/pose.h"
 #include "svort_ros/geometry/rigid_transform.h"
 
@@ -150,14 +152,15 @@ void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument("pose_consensus: " + message);
 }
 
-}  // namespace
-
-torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& options) {
+/// @throws std::invalid_argument naming what does not fit
+std::vector<Vote> checked_votes(const PoseVotes& votes, const ConsensusOptions& options) {
   require(options.robust_mm > 0. && std::isfinite(options.robust_mm), "robust_mm must be positive");
   require(options.candidates > 0, "candidates must be positive");
   require(options.refined > 0, "refined must be positive");
   require(options.iterations > 0, "iterations must be positive");
   require(std::isfinite(options.stack_prior), "stack_prior must be finite");
+  require(options.views >= 1 && options.views <= 100, "views must be 1 to 100");
+  require(options.motion_cost > 0. && std::isfinite(options.motion_cost), "motion_cost must be positive");
   require(votes.direct.defined() && votes.direct.dim() == 2 && votes.direct.size(1) == 9, "direct must be n x 9");
   const std::int64_t n = votes.direct.size(0);
   const bool has_mirrored = votes.mirrored.defined();
@@ -176,8 +179,6 @@ torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& opt
   const torch::Tensor nominal_points = anchor_points_from_matrix(nominal, votes.frame).contiguous();
   const torch::Tensor direct = votes.direct.to(torch::kFloat64).contiguous();
   const torch::Tensor mirrored = has_mirrored ? votes.mirrored.to(torch::kFloat64).contiguous() : direct;
-  const torch::Tensor stack = votes.stack.contiguous();
-  std::map<std::int64_t, std::vector<std::int64_t>> stacks;
   std::vector<Vote> all(static_cast<std::size_t>(n));
   for (std::int64_t i = 0; i < n; ++i) {
     Vote& vote = all[static_cast<std::size_t>(i)];
@@ -189,9 +190,45 @@ torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& opt
       const double ratio = static_cast<double>(votes.scale[i].item<float>()) / options.robust_mm;
       vote.weight = 1. / (0.01 + ratio * ratio);
     }
-    stacks[stack.data_ptr<std::int64_t>()[i]].push_back(i);
   }
+  return all;
+}
 
+/// Slices that the votes are of, each the same number of times.
+std::size_t slices_of(const std::vector<Vote>& votes, const torch::Tensor& motions) {
+  require(motions.defined() && motions.dim() == 3 && motions.size(0) > 0 &&
+              votes.size() % static_cast<std::size_t>(motions.size(0)) == 0,
+          "motions must be n x 3 x 4, one per slice");
+  return static_cast<std::size_t>(motions.size(0));
+}
+
+torch::Tensor tensor_of(const std::vector<Pose>& motions) {
+  torch::Tensor result = torch::empty({static_cast<std::int64_t>(motions.size()), 3, 4});
+  for (std::size_t i = 0; i < motions.size(); ++i)
+    result[static_cast<std::int64_t>(i)] = tensor_from_pose(motions[i])[0];
+  return result;
+}
+
+/// Half the weighted squared distance of points, in the six numbers of motion() that moves `from`.
+void add_points(const Points& from, const Points& to, double weight, SliceTerms* terms) {
+  for (int point = 0; point < 3; ++point) {
+    const Eigen::Vector3d x = from.col(point), difference = x - to.col(point);
+    Eigen::Matrix<double, 3, 6> jacobian;
+    jacobian << 0., x.z(), -x.y(), 1., 0., 0., -x.z(), 0., x.x(), 0., 1., 0., x.y(), -x.x(), 0., 0., 0., 1.;
+    terms->hessian += weight * jacobian.transpose() * jacobian;
+    terms->gradient += weight * jacobian.transpose() * difference;
+  }
+}
+
+}  // namespace
+
+torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& options) {
+  const std::vector<Vote> all = checked_votes(votes, options);
+  const std::int64_t n = votes.direct.size(0);
+  const bool has_mirrored = votes.mirrored.defined();
+  const torch::Tensor stack = votes.stack.contiguous();
+  std::map<std::int64_t, std::vector<std::int64_t>> stacks;
+  for (std::int64_t i = 0; i < n; ++i) stacks[stack.data_ptr<std::int64_t>()[i]].push_back(i);
   std::vector<Pose> motions(static_cast<std::size_t>(n), Pose::Identity());
   const auto members = [&all](const std::vector<std::int64_t>& slices) {
     std::vector<Vote> result;
@@ -215,9 +252,86 @@ torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& opt
     for (const std::int64_t i : slices) motions[static_cast<std::size_t>(i)] = motion;
   }
 
-  torch::Tensor result = torch::empty({n, 3, 4});
-  for (std::int64_t i = 0; i < n; ++i) result[i] = tensor_from_pose(motions[static_cast<std::size_t>(i)])[0];
-  return result;
+  return tensor_of(motions);
+}
+
+torch::Tensor trajectory_consensus(const PoseVotes& votes, const torch::Tensor& start,
+                                   const ConsensusOptions& options) {
+  // Reweighted least squares; both losses begin wide, so that what begins as an outlier may still pull.
+  constexpr int kSteps = 30, kSettled = 16;
+  constexpr double kWideRobust = 4., kRobustFactor = 0.8;                 // of robust_mm, and from step to step
+  constexpr double kWideRestMm = 10., kRestFactor = 0.75, kRestMm = 0.3;  // motions below this are rest
+  constexpr double kLeverMm = 40., kLargestStepMm = 20., kSettledMm = 0.05;
+  constexpr double kBetweenStacks = 0.3;  // of motion_cost: there is more time
+  const std::vector<Vote> all = checked_votes(votes, options);
+  const std::size_t n = slices_of(all, start);
+  const bool has_mirrored = votes.mirrored.defined();
+  const double share = static_cast<double>(n) / static_cast<double>(all.size()) / (has_mirrored ? 2. : 1.);
+  std::vector<std::int64_t> stack(n);
+  for (std::size_t i = 0; i < n; ++i) stack[i] = votes.stack[static_cast<std::int64_t>(i)].item<std::int64_t>();
+
+  std::vector<Pose> motions;
+  for (std::size_t i = 0; i < n; ++i) motions.push_back(pose_from_tensor(start[static_cast<std::int64_t>(i)]));
+  double robust = kWideRobust * options.robust_mm, rest_mm = kWideRestMm;
+  for (int step = 0; step < kSteps; ++step) {
+    std::vector<SliceTerms> terms(n);
+    for (std::size_t k = 0; k < all.size(); ++k) {
+      const Vote& vote = all[k];
+      const Points here = moved(motions[k % n], vote.nominal);
+      const double scale =
+          votes.scale.defined() ? votes.scale[static_cast<std::int64_t>(k)].item<float>() : options.robust_mm;
+      // Mean over the three points, as the scale is.
+      const double weight = share / (3. * scale * scale);
+      const auto add = [&](const Points& to) {
+        add_points(here, to, weight * influence(squared_distance(here, to), robust), &terms[k % n]);
+      };
+      add(vote.direct);
+      if (!has_mirrored) continue;
+      const Points other = reflected(vote.mirrored);
+      add(squared_distance(here, vote.mirrored) <= squared_distance(here, other) ? vote.mirrored : other);
+    }
+    std::vector<double> spread_mm;  // quadratic bounds of the total variation
+    for (std::size_t i = 0; i + 1 < n; ++i) {
+      const bool within = stack[i] == stack[i + 1];
+      const double size = motion_size(twist_of(motions[i + 1] * motions[i].inverse()), kLeverMm);
+      const double cost = options.motion_cost * (within ? 1. : kBetweenStacks);
+      spread_mm.push_back(within || votes.common_frame ? std::sqrt(std::hypot(size, rest_mm) / cost)
+                                                       : std::numeric_limits<double>::infinity());
+    }
+    WalkOptions walk;
+    walk.lever_mm = kLeverMm;
+    walk.jump_mm = std::numeric_limits<double>::infinity();  // the bounds are all the robustness there is
+    double largest = 0.;
+    const std::vector<Vector6d> steps = solve_trajectory(terms, motions, spread_mm, walk);
+    for (std::size_t i = 0; i < n; ++i) {
+      const double size = motion_size(steps[i], kLeverMm);
+      motions[i] = motion(size > kLargestStepMm ? Vector6d(steps[i] * (kLargestStepMm / size)) : steps[i]) * motions[i];
+      largest = std::max(largest, size);
+    }
+    robust = std::max(options.robust_mm, kRobustFactor * robust);
+    rest_mm = std::max(kRestMm, kRestFactor * rest_mm);
+    if (step >= kSettled && largest < kSettledMm) break;
+  }
+  return tensor_of(motions);
+}
+
+double vote_agreement(const PoseVotes& votes, const torch::Tensor& motions, const ConsensusOptions& options) {
+  const std::vector<Vote> all = checked_votes(votes, options);
+  const std::size_t n = slices_of(all, motions);
+  std::vector<Pose> poses;
+  for (std::size_t i = 0; i < n; ++i) poses.push_back(pose_from_tensor(motions[static_cast<std::int64_t>(i)]));
+  const double squared = options.robust_mm * options.robust_mm;
+  std::size_t asked = 0, agree = 0;
+  for (std::size_t k = 0; k < all.size(); ++k) {
+    const Points here = moved(poses[k % n], all[k].nominal);
+    agree += squared_distance(here, all[k].direct) < squared;
+    ++asked;
+    if (!votes.mirrored.defined()) continue;
+    agree +=
+        std::min(squared_distance(here, all[k].mirrored), squared_distance(here, reflected(all[k].mirrored))) < squared;
+    ++asked;
+  }
+  return static_cast<double>(agree) / static_cast<double>(asked);
 }
 
 }  // namespace svort

@@ -5,7 +5,6 @@
 
 #include "svort_ros/geometry/anchor_points.h"
 #include "svort_ros/geometry/rigid_transform.h"
-#include "svort_ros/network/pose_consensus.h"
 #include "svort_ros/simulation/random_stream.h"
 #include "svort_ros/training/losses.h"
 
@@ -89,7 +88,7 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
   const auto share = [](double value) { return value >= 0. && value <= 1.; };
   const auto size = [](double value) { return value >= 0. && std::isfinite(value); };
   require(share(options.first_share), "first_share", "0 to 1");
-  require(share(options.unmoved_share), "unmoved_share", "0 to 1");
+  require(share(options.placed_share), "placed_share", "0 to 1");
   require(share(options.second_update_share), "second_update_share", "0 to 1");
   require(share(options.pulls_unknown_share), "pulls_unknown_share", "0 to 1");
   require(options.beta > 0. && std::isfinite(options.beta), "beta", "positive");
@@ -128,19 +127,13 @@ StepLoss LiveRecipe::first_loss(const NetworkInput& input, const torch::Tensor& 
                   torch::binary_cross_entropy_with_logits(said.quality, good, {}, {}, torch::Reduction::None)}});
 }
 
-torch::Tensor LiveRecipe::warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index) const {
+torch::Tensor LiveRecipe::warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index) {
+  const torch::NoGradGuard no_grad;
   RandomStream random(seed_, step * 64 + index, kWarmStart);
   const std::int64_t n = scan.truth.size(0);
   torch::Tensor start;
-  if (random.chance(options_.unmoved_share)) {
-    // The one head pose that fits the truth best: what a perfect first network would find.
-    PoseVotes votes;
-    votes.nominal = scan.input.transforms.cpu();
-    votes.frame = live_anchor_frame(network_->options());
-    votes.direct = anchor_points_from_matrix(scan.truth.cpu(), votes.frame);
-    votes.stack = scan.input.positions.select(1, 1).cpu().round().to(torch::kInt64);
-    votes.common_frame = scan.input.common_frame;
-    start = compose_transforms(pose_consensus(votes, network_->options().consensus), votes.nominal);
+  if (random.chance(options_.placed_share)) {
+    start = network_->place(network_->encode(scan.input.slices, scan.input.slice_resolution_mm), scan.input).cpu();
   } else {
     // A walk in acquisition order plus what each slice does on its own, both of a size drawn for the scan.
     const double size = random.uniform();

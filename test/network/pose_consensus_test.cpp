@@ -131,6 +131,90 @@ TEST(PoseConsensus, PointsOnALineGiveARigidMotionAllTheSame) {
   EXPECT_TRUE(found.isfinite().all().item<bool>());
 }
 
+// A head that rests, jumps before slice 14 and rests again; in a frame that is known, if `start` is the truth's.
+torch::Tensor jumping_head(std::int64_t n, const torch::Tensor& before, const torch::Tensor& after) {
+  return torch::cat({before.expand({14, 3, 4}), after.expand({n - 14, 3, 4})}).contiguous();
+}
+
+// The same for a motion of every slice.
+double trajectory_error_mm(const torch::Tensor& found, const torch::Tensor& truth, const PoseVotes& votes) {
+  const torch::Tensor nominal = votes.nominal.slice(0, 0, truth.size(0));
+  const auto points = [&](const torch::Tensor& motions) {
+    return svort::anchor_points_from_matrix(svort::compose_transforms(motions, nominal), kFrame);
+  };
+  return (points(found) - points(truth)).view({-1, 3, 3}).norm(2, 2).mean().item<double>();
+}
+
+TEST(TrajectoryConsensus, FindsAJumpThatNoSingleVoteTells) {
+  torch::manual_seed(5);
+  PoseVotes votes = orthogonal_stacks(3, 12);
+  const torch::Tensor before = motion(0.4, -0.2, 1.1, 3., 5., -2.), after = motion(1.1, -0.6, 0.9, 15., 0., 8.);
+  const torch::Tensor truth = jumping_head(36, before, after);
+  const torch::Tensor exact = svort::anchor_points_from_matrix(svort::compose_transforms(truth, votes.nominal), kFrame);
+  constexpr double kNoise = 8.;  // per coordinate: 13 mm per point
+  votes.direct = exact + kNoise * torch::randn_like(exact);
+  const torch::Tensor flip = (torch::rand({36, 1}) < 0.5);
+  votes.mirrored = torch::where(flip, reflected(exact), exact) + kNoise * torch::randn_like(exact);
+  votes.scale = torch::full({36}, 13.);
+  const torch::Tensor still = svort::pose_consensus(votes, {});
+  const torch::Tensor found = svort::trajectory_consensus(votes, still, {});
+  EXPECT_GT(trajectory_error_mm(still, truth, votes), 15.);
+  EXPECT_LT(trajectory_error_mm(found, truth, votes), 6.);
+  // Votes from two sides count as much together as those from one.
+  PoseVotes twice = votes;
+  for (auto member :
+       {&PoseVotes::nominal, &PoseVotes::direct, &PoseVotes::mirrored, &PoseVotes::scale, &PoseVotes::stack})
+    twice.*member = torch::cat({votes.*member, votes.*member});
+  EXPECT_LT(trajectory_error_mm(svort::trajectory_consensus(twice, still, {}), found, votes), 0.1);
+  EXPECT_GT(svort::vote_agreement(votes, found, {}), svort::vote_agreement(votes, still, {}));
+}
+
+TEST(TrajectoryConsensus, AHeadAtRestStaysSoMoreTheMoreItsMotionCosts) {
+  torch::manual_seed(6);
+  PoseVotes votes = orthogonal_stacks(3, 12);
+  const torch::Tensor truth = motion(0.4, -0.2, 1.1, 3., 5., -2.).expand({36, 3, 4}).contiguous();
+  votes.direct = points_after(truth[0].unsqueeze(0), votes) + 8. * torch::randn({36, 9});
+  votes.scale = torch::full({36}, 13.);
+  const torch::Tensor still = svort::pose_consensus(votes, {});
+  ConsensusOptions options;
+  double last = 1e9;
+  for (const double cost : {0.02, 0.2, 2.}) {
+    options.motion_cost = cost;
+    const torch::Tensor found = svort::trajectory_consensus(votes, still, options);
+    const double moved = trajectory_error_mm(found, found[0].unsqueeze(0).expand({36, 3, 4}).contiguous(), votes);
+    EXPECT_LT(moved, last) << cost;
+    last = moved;
+  }
+  EXPECT_LT(last, 0.5);
+  EXPECT_EQ(svort::vote_agreement(votes, still, {}), 1.);
+}
+
+TEST(TrajectoryConsensus, StacksWithoutACommonFrameAreNotTied) {
+  PoseVotes votes = orthogonal_stacks(2, 9);
+  const torch::Tensor first = motion(1., 0., 0.5, 0., 10., 0.), second = motion(0., -2., 0.1, 4., 0., -20.);
+  const torch::Tensor truth = torch::cat({first.expand({9, 3, 4}), second.expand({9, 3, 4})}).contiguous();
+  votes.direct = svort::anchor_points_from_matrix(svort::compose_transforms(truth, votes.nominal), kFrame);
+  votes.common_frame = false;
+  ConsensusOptions options;
+  options.motion_cost = 100.;
+  EXPECT_LT(trajectory_error_mm(svort::trajectory_consensus(votes, truth, options), truth, votes), 1e-2);
+}
+
+TEST(TrajectoryConsensus, RejectsWhatDoesNotFit) {
+  PoseVotes votes = orthogonal_stacks(1, 4);
+  votes.direct = torch::zeros({4, 9});
+  const torch::Tensor start = votes.nominal;
+  EXPECT_NO_THROW(svort::trajectory_consensus(votes, start, {}));
+  EXPECT_THROW(svort::trajectory_consensus(votes, start.slice(0, 0, 3), {}), std::invalid_argument);
+  EXPECT_THROW(svort::vote_agreement(votes, start.slice(0, 0, 3), {}), std::invalid_argument);
+  ConsensusOptions options;
+  options.motion_cost = 0.;
+  EXPECT_THROW(svort::trajectory_consensus(votes, start, options), std::invalid_argument);
+  options = {};
+  options.views = 0;
+  EXPECT_THROW(svort::pose_consensus(votes, options), std::invalid_argument);
+}
+
 TEST(PoseConsensus, RejectsWhatDoesNotFit) {
   PoseVotes votes = orthogonal_stacks(1, 3);
   votes.direct = torch::zeros({3, 9});

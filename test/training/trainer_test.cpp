@@ -286,7 +286,7 @@ TEST_F(TrainerTest, MixedPrecisionIsRefusedOnTheCpu) {
 TEST_F(TrainerTest, WarmStartsAreTheTruthIfNothingPerturbsThem) {
   torch::manual_seed(7);
   LiveRecipeOptions options;
-  options.first_share = options.unmoved_share = options.second_update_share = 0.;
+  options.first_share = options.placed_share = options.second_update_share = 0.;
   options.perturb_deg = options.perturb_mm = options.global_deg = options.global_mm = 0.;
   LiveRecipe still(std::make_shared<LiveNetwork>(small_network()), options, 1);
   const auto scans = simulator()->simulate(0, 1);
@@ -371,10 +371,11 @@ TEST_F(TrainerTest, ValidationMeasuresTheNetworksSteps) {
   Trainer trainer(recipe(), {simulator()}, simulator(9), quick(), folder_);
   const ValidationResult result = trainer.validate();
   ASSERT_EQ(result.ed_mm.size(), 3U);
-  // The first iteration moves all slices of a scan together: relative to each other they stay as prescribed.
-  EXPECT_NEAR(result.relative_ed_mm[0], result.nominal_relative_ed_mm, 1e-3);
-  EXPECT_GT(result.ed_mm[0], result.relative_ed_mm[0]);
-  EXPECT_LE(result.gd_rad[0], M_PI);
+  EXPECT_GT(result.nominal_relative_ed_mm, 0.);
+  for (std::size_t k = 0; k < 3; ++k) {
+    EXPECT_GT(result.ed_mm[k], result.relative_ed_mm[k]);
+    EXPECT_LE(result.gd_rad[k], M_PI);
+  }
 }
 
 TEST_F(TrainerTest, StartsFromWeightsOfANetworkThatHasChangedSinceAndGoesOnWithOtherScans) {

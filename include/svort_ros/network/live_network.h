@@ -102,6 +102,12 @@ struct LiveOutput {
   torch::Tensor quality;    ///< n: logit of the slice's weight
 };
 
+/// A frame that slices were placed in, seen from the canonical frame.
+struct LiveFrame {
+  torch::Tensor motion;   ///< 1 x 3 x 4, trans_first, mm
+  double agreement = 0.;  ///< vote_agreement() on it
+};
+
 /// Levels of blur at which images pull slices.
 constexpr std::int64_t kLivePulls = static_cast<std::int64_t>(kRefinementLevels);
 
@@ -116,11 +122,12 @@ struct LivePulls {
 /// The network for live use: every slice is encoded once, whatever comes after it.
 ///
 /// The first network estimates the anchor points of each slice from the image and from where all slices were
-/// prescribed; pose_consensus() turns that into one head pose. The second, shared by all later iterations, sees each
-/// slice beside the slice simulated from the volume at its current place, hears where images pull it, and moves it: by
-/// a mean of the pulls with weights that it chooses, and a correction of its own. Both normalise each slice on its own
-/// (group norm), so encode() of a slice never changes; attend() runs over all slices that are there, 1 to 450 of them,
-/// any prefix of a scan.
+/// prescribed; from these votes follow a head pose (pose_consensus()) and how the head has moved
+/// (trajectory_consensus()). The second, shared by all later iterations, sees each slice beside the slice simulated
+/// from the volume at its current place, hears where images pull it, and moves it: by a mean of the pulls with weights
+/// that it chooses, and a correction of its own; the first network then says again where the whole lies (find_frame()).
+/// Both normalise each slice on its own (group norm), so encode() of a slice never changes; attend() runs over all
+/// slices that are there, 1 to 450 of them, any prefix of a scan.
 class LiveNetwork : public PoseNetwork {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -144,6 +151,18 @@ class LiveNetwork : public PoseNetwork {
   /// @param attention if not null, receives per layer b x heads x l x l
   LiveOutput attend(const torch::Tensor& features, const NetworkInput& input,
                     const std::vector<std::int64_t>& lengths = {}, std::vector<torch::Tensor>* attention = nullptr);
+
+  /// The first network asked several times, the prescription turned in between (ConsensusOptions::views): which way the
+  /// scanner's axes lie must not matter, and votes from several sides are off less than those from one.
+  /// @param attention if not null, receives that of the first view
+  PoseVotes vote(const torch::Tensor& features, const NetworkInput& input,
+                 std::vector<torch::Tensor>* attention = nullptr);
+  /// Where the first network puts the slices, after vote(), pose_consensus() and trajectory_consensus().
+  /// @return n x 3 x 4
+  torch::Tensor place(const torch::Tensor& features, const NetworkInput& input,
+                      std::vector<torch::Tensor>* attention = nullptr);
+  /// Where slices whose places relative to each other are known, in one frame, lie in the brain's canonical frame.
+  LiveFrame find_frame(const torch::Tensor& features, const NetworkInput& placed);
 
   /// Shared network: one update. `input.transforms` are the current places in the brain frame.
   /// @param simulated n x kLiveSimulatedChannels x input_px x input_px, see simulate_live_channels()

@@ -43,7 +43,7 @@ struct LiveRecipeOptions {
   double mirror_weight = 1.;         ///< of the mirror head's loss
   double scale_weight = 0.05;        ///< of the loss of the expected error
   double quality_weight = 0.05;      ///< of the loss of the slice's weight
-  double unmoved_share = 0.5;        ///< share of scans that start as the first network leaves them, with their motion
+  double placed_share = 0.5;         ///< share of scans that start where the first network, as it is now, places them
   double perturb_deg = 8.;           ///< rotation of perturbed slices, per axis, at most, degrees
   double perturb_mm = 6.;            ///< displacement of perturbed slices, per axis, at most, mm
   double global_deg = 6.;            ///< rotation of the whole start, per axis, degrees
@@ -58,8 +58,8 @@ struct LiveRecipeOptions {
     v("mirror_weight", mirror_weight, "weight of the mirror head's loss");
     v("scale_weight", scale_weight, "weight of the loss of the expected error");
     v("quality_weight", quality_weight, "weight of the loss of the slices' quality");
-    v("unmoved_share", unmoved_share,
-      "share of warm starts that still have the scan's motion; others are perturbed truth");
+    v("placed_share", placed_share,
+      "share of warm starts that the first network has placed, as it is now; others are perturbed truth");
     v("perturb_deg", perturb_deg, "largest rotation of perturbed slices, per axis, degrees");
     v("perturb_mm", perturb_mm, "largest displacement of perturbed slices, per axis, mm");
     v("global_deg", global_deg, "rotation of the whole start, standard deviation per axis, degrees");
@@ -71,9 +71,9 @@ struct LiveRecipeOptions {
 
 /// Live recipe: smooth L1 on anchor points, a mirror head that may be wrong by a reflection, and warm starts.
 ///
-/// A step trains either the first network, or one random iteration of the shared network: from places as the first
-/// network leaves them (one head pose for the scan, its motion not yet known) or from the truth, perturbed, after
-/// no or one update without gradient. The volume is the PSF reconstruction at those places, without gradient.
+/// A step trains either the first network, or one random iteration of the shared network: from where the first network
+/// places the slices, as it is now, or from the truth, perturbed, after no or one update without gradient. The volume
+/// is the PSF reconstruction at those places, without gradient.
 class LiveRecipe : public TrainingRecipe {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -84,7 +84,7 @@ class LiveRecipe : public TrainingRecipe {
   StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
 
  private:
-  torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index) const;
+  torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index);
   StepLoss first_loss(const NetworkInput& input, const torch::Tensor& truth, const torch::Tensor& good,
                       const std::vector<std::int64_t>& lengths);
   StepLoss shared_loss(const std::vector<SimulatedScan>& scans, NetworkInput input, const torch::Tensor& truth,
