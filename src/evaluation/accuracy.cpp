@@ -5,11 +5,13 @@
 #include <algorithm>
 #include <cmath>
 #include <map>
+#include <optional>
 #include <stdexcept>
 #include <utility>
 
 #include "scored_poses.h"
 #include "svort_ros/geometry/rigid_fit.h"
+#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
 #include "svort_ros/reconstruction/final_volume.h"
@@ -113,7 +115,7 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   options.estimator.method = "nominal";
   if (live) {
     options.estimator.method = "registration";
-    options.estimator.network.candidate = !method.weights.empty();
+    options.estimator.network.guide = !method.weights.empty();
     options.estimator.network.weights = method.weights;
   }
   if (method.source == PoseSource::network) {
@@ -162,6 +164,11 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
   }
   answer.weights.assign(row.slices, 1.);
   std::vector<Pose> crops = input.T_world_slice;
+  std::optional<NetworkGuide> guide;
+  if (method.source == PoseSource::registration && !method.weights.empty()) {
+    options.estimator.network.weights = method.weights;
+    guide.emplace(options.estimator.network);
+  }
   const Stopwatch after_arrivals;
   if (method.source == PoseSource::network) {
     pipeline.finalise();
@@ -177,9 +184,11 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     RefinementOptions refinement = options.estimator.registration;
     if (method.source == PoseSource::stacks) refinement.trajectory_passes = 0;
     const std::vector<Pose> start = crops;
+    std::vector<std::vector<Pose>> starts = {start};
+    if (guide) starts.insert(starts.begin(), guide->place(sequence));
     // From the scanner's poses the stacks may be anywhere; from a network's or for the stack stage, these poses count.
     const Refinement refined = method.source == PoseSource::registration
-                                   ? register_scan(input, {start}, options.estimator.volume_size_mm, refinement,
+                                   ? register_scan(input, starts, options.estimator.volume_size_mm, refinement,
                                                    options.estimator.template_match)
                                    : refine_poses(input, start, refinement);
     crops.clear();
@@ -232,6 +241,11 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     };
     row.atlas = score(setup.atlas);
     row.shipped = score(setup.shipped);
+  }
+  if (guide) {
+    const NetworkGuide::Frame frame = guide->find_frame(sequence, crops);
+    row.guide =
+        score_frame(answer.T_brain_slice, answer.truth, frame.T_canonical_brain, frame.agreement >= kFrameAgreement);
   }
   if (method.with_volume) {
     // In the frame of the truth, so that only the shape of the volume counts, not where it is.

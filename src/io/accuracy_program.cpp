@@ -65,8 +65,11 @@ std::vector<Task> all_tasks(const Plan& plan) {
     const std::string name = network.substr(0, split), file = network.substr(split + 1);
     tasks.push_back({false, 3, {name, PoseSource::network, file, false, true}});
     tasks.push_back({false, 3, {name + " then registration", PoseSource::network, file, true, true}});
-    if (read_checkpoint(file).network == "live")
-      tasks.push_back({false, 3, {"live at arrival with " + name, PoseSource::live, file, false, false}});
+    if (read_checkpoint(file).network != "live") continue;
+    tasks.push_back({false, 3, {"registration guided by " + name, PoseSource::registration, file, false, true}});
+    tasks.push_back({true, 3, {"the same with damaged masks", PoseSource::registration, file, false, true}});
+    tasks.push_back({false, 1, {"the same of one stack", PoseSource::registration, file, false, true}});
+    tasks.push_back({false, 3, {"live at arrival guided by " + name, PoseSource::live, file, false, false}});
   }
   return tasks;
 }
@@ -212,8 +215,8 @@ int run_svort_accuracy(int argc, char** argv) {
   app.add_option("--real-masks", plan.real_masks, "their brain masks");
   app.add_option(
       "--network", plan.networks,
-      "NAME=FILE of weights: a row of that network, one with registration, and, for the live network, one of "
-      "live poses with its candidates");
+      "NAME=FILE of weights: a row of that network, one with registration afterwards, and, for the live network, rows "
+      "of registration and of live poses that it guides");
   app.add_option("--output", plan.output, "folder for the results; made if needed")->required();
   app.add_option("--seed", plan.seed, "of all random numbers")->capture_default_str();
   app.add_option("--threads", plan.threads, "0: all cores")->capture_default_str();

@@ -137,6 +137,16 @@ const std::vector<CsvColumn<AccuracyRow>>& accuracy_columns() {
     add(
         "shipped_sure", [](AccuracyRow & r) -> auto& { return r.shipped.sure; });
     add(
+        "guide_ed_mm", [](AccuracyRow & r) -> auto& { return r.guide.ed_mm; });
+    add(
+        "guide_median_ed_mm", [](AccuracyRow & r) -> auto& { return r.guide.median_ed_mm; });
+    add(
+        "guide_gd_rad", [](AccuracyRow & r) -> auto& { return r.guide.gd_rad; });
+    add(
+        "guide_frame_rad", [](AccuracyRow & r) -> auto& { return r.guide.frame_rad; });
+    add(
+        "guide_sure", [](AccuracyRow & r) -> auto& { return r.guide.sure; });
+    add(
         "psf_psnr_db", [](AccuracyRow & r) -> auto& { return r.psf.psnr_db; });
     add(
         "psf_ssim", [](AccuracyRow & r) -> auto& { return r.psf.ssim; });
@@ -205,7 +215,8 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
   };
   std::ostringstream text;
   text << "| motion | poses | scans | relative ED, mm | relative GD, rad | ED, mm | GD, rad | turned | ED, shipped "
-          "template, mm | turned | s |\n|---|---|---|---|---|---|---|---|---|---|---|\n";
+          "template, mm | turned | ED, network's frame, mm | GD, rad | turned | s "
+          "|\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n";
   for_groups([&](const std::string& motion, const std::string& method, const Group& group) {
     text << "| " << motion << " | " << method << " | " << group.size() << " | "
          << group.cell([](const AccuracyRow& r) { return r.relative_ed_mm; }, 2) << " | "
@@ -215,6 +226,9 @@ std::string accuracy_markdown(const std::vector<AccuracyRow>& rows) {
          << group.turned(&AccuracyRow::atlas) << " | "
          << group.cell([](const AccuracyRow& r) { return r.shipped.ed_mm; }, 2) << " | "
          << group.turned(&AccuracyRow::shipped) << " | "
+         << group.cell([](const AccuracyRow& r) { return r.guide.ed_mm; }, 2) << " | "
+         << group.cell([](const AccuracyRow& r) { return r.guide.gd_rad; }, 3) << " | "
+         << group.turned(&AccuracyRow::guide) << " | "
          << fixed(group.mean([](const AccuracyRow& r) { return r.seconds; }), 1) << " |\n";
   });
   text << "\nMean / median over scans of each scan's mean over slices. Relative: after the one rigid transform that "

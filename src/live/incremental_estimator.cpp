@@ -5,6 +5,7 @@
 
 #include "svort_ros/live/network_candidates.h"
 #include "svort_ros/live/network_estimator.h"
+#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/nominal_estimator.h"
 #include "svort_ros/live/registration_estimator.h"
 
@@ -29,9 +30,10 @@ const char* to_string(PoseStatus status) {
 std::unique_ptr<IncrementalEstimator> make_estimator(const EstimatorOptions& options,
                                                      std::vector<BrainTemplate> templates) {
   if (options.method == "registration") {
-    if (!options.network.candidate) return std::make_unique<RegistrationEstimator>(options, std::move(templates));
-    return std::make_unique<RegistrationEstimator>(options, std::move(templates),
-                                                   std::make_unique<NetworkCandidates>(options.network));
+    return std::make_unique<RegistrationEstimator>(
+        options, std::move(templates),
+        options.network.candidate ? std::make_unique<NetworkCandidates>(options.network) : nullptr,
+        options.network.guide ? std::make_unique<NetworkGuide>(options.network) : nullptr);
   }
   if (options.method == "nominal") return std::make_unique<NominalEstimator>(options);
   if (options.method == "network") return std::make_unique<NetworkEstimator>(options);

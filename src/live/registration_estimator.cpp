@@ -12,6 +12,7 @@
 
 #include "scan_search.h"
 #include "svort_ros/geometry/rigid_fit.h"
+#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
 #include "svort_ros/registration/canonical_frame.h"
@@ -28,6 +29,8 @@ constexpr double kMovingMm = 2.;        // from slice to slice; a head that move
 constexpr int kLongestSearchPause = 4;
 constexpr double kBetterAgreement = 0.003;
 constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
+constexpr double kGuidedMm = 2.;     // closer to the prediction, registration ends where it does from there
+constexpr double kFrameDisagreement = 40. * M_PI / 180.;  // a template's match that lies so far off is not believed
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
 double half_field_mm(const SliceSequence& sequence) {
@@ -37,8 +40,9 @@ double half_field_mm(const SliceSequence& sequence) {
 }  // namespace
 
 RegistrationEstimator::RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates,
-                                             std::unique_ptr<CandidateSource> source)
-    : options_(options), templates_(std::move(templates)), source_(std::move(source)) {
+                                             std::unique_ptr<CandidateSource> source,
+                                             std::unique_ptr<NetworkGuide> guide)
+    : options_(options), templates_(std::move(templates)), source_(std::move(source)), guide_(std::move(guide)) {
   svort::validate(options);
   validate(options.registration);
   validate(options.template_match);
@@ -67,6 +71,7 @@ std::vector<Pose> RegistrationEstimator::crop_poses(const SliceSequence& sequenc
 }
 
 void RegistrationEstimator::add(const SliceSequence& sequence) {
+  estimate_.encoded = 0;
   const auto newest = sequence.newest_arrival();
   if (!newest) throw std::logic_error("RegistrationEstimator::add: the sequence holds no slice");
   const auto& ordered = sequence.slices();
@@ -107,8 +112,9 @@ void RegistrationEstimator::add(const SliceSequence& sequence) {
   const bool stack_began = slices[position].info.stack != slices[position > 0 ? position - 1 : 0].info.stack;
   if (slices.size() >= kFewestForTemplate &&
       (stack_began || (!aligned_ && slices.size() >= aligned_count_ + kSlicesBetweenMatches))) {
-    align_to_template(sequence, registration_input(sequence));
+    align(sequence, registration_input(sequence));
   }
+  if (guide_) estimate_.encoded += guide_->take_encoded();
   estimate_.scan_id = sequence.scan_id();
   estimate_.final = false;
   ++estimate_.revision;
@@ -156,10 +162,11 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
     if (plane_distance(start(on), predicted, options_.registration.lever_mm) > kMovingMm)
       candidates.push_back({"motion goes on", start(on)});
   }
+  if (guide_ && incremental_->compares()) propose_guided(sequence, position, &candidates);
   if (source_) {
     for (PoseCandidate& candidate : source_->propose(sequence, position, *incremental_))
       candidates.push_back(std::move(candidate));
-    estimate_.encoded = source_->take_encoded();
+    estimate_.encoded += source_->take_encoded();
   }
   slices[position].start = incremental_->choose(position, candidates).name;
   for (std::size_t moved = incremental_->find_lost(position); moved > 0; --moved)
@@ -170,6 +177,26 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   take_incremental(sequence, position);
   idle_left_ = kIdleSweeps * incremental_->windows();
   idle_motion_mm_ = 0.;
+}
+
+void RegistrationEstimator::propose_guided(const SliceSequence& sequence, std::size_t position,
+                                           std::vector<PoseCandidate>* candidates) {
+  const std::vector<RefinedSlice>& engine = incremental_->slices();
+  const std::vector<Pose> placed = guide_->place(sequence);
+  std::vector<Pose> here, there;
+  for (std::size_t i = 0; i < engine.size(); ++i) {
+    if (i == position) continue;
+    here.push_back(placed[i]);
+    there.push_back(engine[i].T_brain_slice);
+  }
+  const double lever_mm = options_.registration.lever_mm;
+  const auto propose = [&](const Pose& T_engine_slice) {
+    if (plane_distance(T_engine_slice, candidates->front().T_brain_slice, lever_mm) > kGuidedMm)
+      candidates->push_back({"network", T_engine_slice});
+  };
+  // As all the others lie; and as the slice before does, which tells a jump best.
+  propose(fit_most_planes(here, there, half_field_mm(sequence)) * placed[position]);
+  if (position > 0) propose(engine[position - 1].T_brain_slice * placed[position - 1].inverse() * placed[position]);
 }
 
 void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std::size_t newest) {
@@ -216,7 +243,8 @@ void RegistrationEstimator::search(const SliceSequence& sequence) {
 void RegistrationEstimator::start_search(const SliceSequence& sequence) {
   std::vector<Pose> followed;
   for (const RefinedSlice& slice : incremental_->slices()) followed.push_back(slice.T_brain_slice);
-  search_->start(sequence, followed, options_.volume_size_mm, options_.registration, options_.template_match);
+  const std::vector<Pose> guess = guide_ ? guide_->place(sequence) : std::vector<Pose>();
+  search_->start(sequence, followed, guess, options_.volume_size_mm, options_.registration, options_.template_match);
 }
 
 bool RegistrationEstimator::take_found(const SliceSequence& sequence) {
@@ -355,17 +383,31 @@ void RegistrationEstimator::move_frame(const Pose& T_new_old) {
   if (source_) source_->move_frame(T_new_old);
 }
 
-void RegistrationEstimator::align_to_template(const SliceSequence& sequence, const RegistrationInput& input) {
+void RegistrationEstimator::align(const SliceSequence& sequence, const RegistrationInput& input) {
   aligned_count_ = estimate_.slices.size();
+  const std::optional<Pose> T_canonical_brain = canonical_frame(sequence, input);
+  if (!T_canonical_brain) return;
+  const bool small =
+      rotation_angle(*T_canonical_brain) < kFrameAngle && T_canonical_brain->translation().norm() < kFrameShiftMm;
+  if (!aligned_ || !small) move_frame(*T_canonical_brain);
+  aligned_ = true;
+}
+
+std::optional<Pose> RegistrationEstimator::canonical_frame(const SliceSequence& sequence,
+                                                           const RegistrationInput& input) {
+  const std::vector<Pose> poses = crop_poses(sequence);
+  std::optional<Pose> voted;
+  if (guide_) {
+    const NetworkGuide::Frame frame = guide_->find_frame(sequence, poses);
+    if (frame.agreement >= kFrameAgreement) voted = frame.T_canonical_brain;
+  }
   std::vector<double> weights;
   for (const SliceEstimate& slice : estimate_.slices) weights.push_back(slice.weight);
-  const auto match = find_canonical_frame(input, crop_poses(sequence), weights, templates_, options_.volume_size_mm,
-                                          options_.template_match);
-  if (!match || !match->sure) return;
-  const bool small = rotation_angle(match->T_template_volume) < kFrameAngle &&
-                     match->T_template_volume.translation().norm() < kFrameShiftMm;
-  if (!aligned_ || !small) move_frame(match->T_template_volume);
-  aligned_ = true;
+  const auto match =
+      find_canonical_frame(input, poses, weights, templates_, options_.volume_size_mm, options_.template_match);
+  if (!match || !match->sure) return voted;
+  const bool contradicted = voted && rotation_angle(voted->inverse() * match->T_template_volume) > kFrameDisagreement;
+  return contradicted ? *voted : match->T_template_volume;
 }
 
 void RegistrationEstimator::update_volume(const SliceSequence& sequence) {
@@ -379,10 +421,12 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::a
   if (estimate_.slices.size() >= kFewestSlices) {
     const RegistrationInput input = registration_input(sequence);
     const std::vector<Pose> current = crop_poses(sequence);
-    // From the scanner's poses, so that the end does not depend on the way; `take` brings it into the frame that is
-    // there.
-    const Refinement end = register_scan(input, {input.T_world_slice}, options_.volume_size_mm, options_.registration,
-                                         options_.template_match, stop);
+    // From the scanner's poses, and from where the network places the slices, so that the end does not depend on the
+    // way; `take` brings it into the frame that is there.
+    std::vector<std::vector<Pose>> starts = {input.T_world_slice};
+    if (guide_) starts.insert(starts.begin(), guide_->place(sequence));
+    const Refinement end =
+        register_scan(input, starts, options_.volume_size_mm, options_.registration, options_.template_match, stop);
     if (stop && stop->load()) return;
     take(sequence, end, current);
     if (incremental_) {
@@ -390,12 +434,19 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::a
       incremental_->measure_uncertainty();
       take_uncertainty();
     }
-    align_to_template(sequence, input);
+    align(sequence, input);
   }
   volume_ = estimate_final_volume(sequence, options_, &estimate_.slices);
   estimate_.agreement = agreement_of(sequence, estimate_.slices);
   estimate_.final = true;
   ++estimate_.revision;
+}
+
+EstimatorNotes RegistrationEstimator::notes() const {
+  EstimatorNotes notes = source_ ? source_->notes() : EstimatorNotes();
+  if (!guide_) return notes;
+  // Both come from the same file.
+  return guide_->notes();
 }
 
 void RegistrationEstimator::reset() {

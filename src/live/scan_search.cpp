@@ -13,18 +13,18 @@ namespace svort {
 
 ScanSearch::~ScanSearch() { give_up(); }
 
-void ScanSearch::start(const SliceSequence& sequence, const std::vector<Pose>& followed, double size_mm,
-                       const RefinementOptions& options, const TemplateOptions& match) {
+void ScanSearch::start(const SliceSequence& sequence, const std::vector<Pose>& followed, const std::vector<Pose>& guess,
+                       double size_mm, const RefinementOptions& options, const TemplateOptions& match) {
   give_up();
   if (unwanted_.valid()) unwanted_.wait();
   slices_ = sequence.slices();
   count_ = slices_.size();
   stop_ = std::make_shared<std::atomic<bool>>(false);
-  const auto search = [input = registration_input(sequence), followed, size_mm, options, match, stop = stop_,
+  const auto search = [input = registration_input(sequence), followed, guess, size_mm, options, match, stop = stop_,
                        threads = thread_count()] {
     const torch::NoGradGuard no_grad;
     const OneCoreScope one_core(threads);
-    return search_scan(input, followed, size_mm, options, match, stop.get());
+    return search_scan(input, followed, guess, size_mm, options, match, stop.get());
   };
   answer_ = std::async(std::launch::async, search);
 }

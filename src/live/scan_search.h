@@ -31,8 +31,9 @@ class ScanSearch {
 
   /// Begins, with the slices as they are now. Whatever ran before is given up.
   /// @param followed one pose per slice of the sequence, of its crop
-  void start(const SliceSequence& sequence, const std::vector<Pose>& followed, double size_mm,
-             const RefinementOptions& options, const TemplateOptions& match);
+  /// @param guess    the same, from elsewhere, tried first; or empty
+  void start(const SliceSequence& sequence, const std::vector<Pose>& followed, const std::vector<Pose>& guess,
+             double size_mm, const RefinementOptions& options, const TemplateOptions& match);
 
   /// It was started, and take() was not called since.
   bool started() const { return answer_.valid(); }

@@ -248,13 +248,15 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
   return stopped() ? trials.best() : trials.finest();
 }
 
-std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,
-                                      const RefinementOptions& options, const TemplateOptions& match,
-                                      const std::atomic<bool>* stop) {
+std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed,
+                                      const std::vector<Pose>& guess, double size_mm, const RefinementOptions& options,
+                                      const TemplateOptions& match, const std::atomic<bool>* stop) {
   validate(input);
-  if (followed.size() != input.count())
-    throw std::invalid_argument("search_scan: " + std::to_string(followed.size()) + " poses for " +
+  for (const std::vector<Pose>* poses : {&followed, &guess}) {
+    if (poses->size() == input.count() || (poses == &guess && guess.empty())) continue;
+    throw std::invalid_argument("search_scan: " + std::to_string(poses->size()) + " poses for " +
                                 std::to_string(input.count()) + " slices");
+  }
   if (!enough_across(input)) return std::nullopt;
   const auto stopped = [&] { return stop && stop->load(); };
   const ScanPieces pieces(input, kPieceSlices, kSearchPixelMm, kSearchBlurMm);
@@ -267,6 +269,7 @@ std::optional<Refinement> search_scan(const RegistrationInput& input, const std:
   const ScanPieces short_pieces(input, kShortPieceSlices, kSearchPixelMm, kSearchBlurMm);
   const std::vector<std::function<void()>> steps = {
       [&] { trials.attempt(followed); },
+      [&] { trials.attempt(guess.empty() ? followed : guess); },  // what has been tried is not tried again
       [&] { trials.attempt(pieces.search(trials.poses(), stop)); },
       [&] { trials.attempt(assemble_stacks(input, input.T_world_slice, size_mm, trials.options(), match)); },
       [&] { trials.attempt(pieces.search(trials.poses(), stop)); },

@@ -151,12 +151,12 @@ TEST(SearchScan, FindsWhereAFollowedHeadWentWithoutTheRestOfTheScan) {
   const std::vector<Pose> followed = poses_of(refine_poses(scan.input, scan.input.T_world_slice, options));
   const double lost = relative_error_mm(followed, scan.truth);
   ASSERT_GT(lost, 10.);
-  const auto found = search_scan(scan.input, followed, kSizeMm, options);
+  const auto found = search_scan(scan.input, followed, {}, kSizeMm, options);
   ASSERT_TRUE(found.has_value());
   EXPECT_LT(relative_error_mm(poses_of(*found), scan.truth), 0.3 * lost);
   EXPECT_GT(coarse_agreement(scan.input, poses_of(*found)), coarse_agreement(scan.input, followed) + 0.02);
   // The same again, to the byte.
-  const auto again = search_scan(scan.input, followed, kSizeMm, options);
+  const auto again = search_scan(scan.input, followed, {}, kSizeMm, options);
   ASSERT_TRUE(again.has_value());
   for (std::size_t i = 0; i < followed.size(); ++i)
     EXPECT_TRUE(found->slices[i].T_brain_slice.isApprox(again->slices[i].T_brain_slice, 0.)) << i;
@@ -168,11 +168,11 @@ TEST(SearchScan, FindsNothingWhereNothingIsLost) {
   const SimulatedScan scan = simulated_scan(how);
   RefinementOptions options;
   options.finest_mm = 2.;
-  EXPECT_FALSE(search_scan(scan.input, scan.truth, kSizeMm, options).has_value());
+  EXPECT_FALSE(search_scan(scan.input, scan.truth, {}, kSizeMm, options).has_value());
   // One stack says nothing about jumps.
   how.stacks = 1;
   const SimulatedScan one = simulated_scan(how);
-  EXPECT_FALSE(search_scan(one.input, one.input.T_world_slice, kSizeMm, options).has_value());
+  EXPECT_FALSE(search_scan(one.input, one.input.T_world_slice, {}, kSizeMm, options).has_value());
 }
 
 TEST(SearchScan, WaitsForSlicesThatLieAcrossTheFirstStack) {
@@ -180,7 +180,7 @@ TEST(SearchScan, WaitsForSlicesThatLieAcrossTheFirstStack) {
   truncate(&scan, 22 + 7);
   RefinementOptions options;
   options.finest_mm = 2.;
-  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, kSizeMm, options).has_value());
+  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, {}, kSizeMm, options).has_value());
 }
 
 TEST(SearchScan, GivesUpWhenItIsTold) {
@@ -188,7 +188,7 @@ TEST(SearchScan, GivesUpWhenItIsTold) {
   const std::atomic<bool> stop{true};
   RefinementOptions options;
   options.finest_mm = 2.;
-  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, kSizeMm, options, {}, &stop).has_value());
+  EXPECT_FALSE(search_scan(scan.input, scan.input.T_world_slice, {}, kSizeMm, options, {}, &stop).has_value());
   const ScanPieces pieces(scan.input, 8, 4., 6.);
   const std::vector<Pose> as_given = pieces.search(scan.input.T_world_slice, &stop);
   for (std::size_t i = 0; i < as_given.size(); ++i)
@@ -266,7 +266,7 @@ TEST(RegisterScan, NamesWhatDoesNotFit) {
   const SimulatedScan scan = simulated_scan(options);
   EXPECT_THROW(register_scan(scan.input, {}, kSizeMm), std::invalid_argument);
   EXPECT_THROW(assemble_stacks(scan.input, {Pose::Identity()}, kSizeMm), std::invalid_argument);
-  EXPECT_THROW(search_scan(scan.input, {Pose::Identity()}, kSizeMm), std::invalid_argument);
+  EXPECT_THROW(search_scan(scan.input, {Pose::Identity()}, {}, kSizeMm), std::invalid_argument);
   EXPECT_THROW(coarse_agreement(scan.input, {Pose::Identity()}), std::invalid_argument);
 }
 

@@ -25,7 +25,7 @@ enum class PoseSource {
 struct PoseMethod {
   std::string name;
   PoseSource source = PoseSource::registration;
-  std::string weights;       ///< file, for a network; live: its answers are candidates (NetworkEstimatorOptions)
+  std::string weights;       ///< file, for a network; registration and live: that of the live network as a guide
   bool refined = false;      ///< registration afterwards, started from these poses ("SVR")
   bool with_volume = false;  ///< reconstruct volumes from these poses and compare them with the truth
 };
@@ -67,6 +67,7 @@ struct AccuracyRow {
   double relative_median_ed_mm = std::numeric_limits<double>::quiet_NaN();
   double relative_gd_rad = std::numeric_limits<double>::quiet_NaN();
   FrameScore atlas, shipped;  ///< templates: brains of other ages; the one that is shipped. A network: atlas only
+  FrameScore guide;           ///< the canonical frame that the live network finds for registered slices
   VolumeScore psf, final;     ///< PSF reconstruction; the final volume
   double seconds = 0.;        ///< for the poses, without the frame and volumes
   double p95_ms = std::numeric_limits<double>::quiet_NaN();  ///< live: arrival to pose, from 80 slices on

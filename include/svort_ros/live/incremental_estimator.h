@@ -64,8 +64,11 @@ struct Estimate {
   bool final = false;       ///< set by finalise(), until the next slice
 };
 
-/// For the method "network", and for the live network as one of the candidates of the method "registration".
+/// For the method "network", and for the live network beside the method "registration".
 struct NetworkEstimatorOptions {
+  /// Method "registration": the live network places the slices coarsely, so that a head that jumps is not lost, and
+  /// says where the canonical frame is (NetworkGuide).
+  bool guide = false;
   bool candidate = false;             ///< method "registration": the live network says where a new slice may be, too
   std::string weights;                ///< file of weights, see svort_checkpoint; its network is the one that runs
   std::string name;                   ///< if not empty, the network that the file must hold
@@ -82,6 +85,7 @@ struct NetworkEstimatorOptions {
 
   template <class Visitor>
   void visit(Visitor&& v) {
+    v("guide", guide, "method registration: the live network finds a head that jumps, and the canonical frame");
     v("candidate", candidate, "method registration: the live network says where a new slice may be, too");
     v("weights", weights, "file of weights; its network is the one that runs");
     v("name", name, "if not empty, the network that the file must hold: v1, v2, ..");

@@ -2,6 +2,7 @@
 
 #include <cstddef>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -11,10 +12,13 @@
 
 namespace svort {
 
+class NetworkGuide;
 class ScanSearch;
 
-/// Head motion without any trained weights: slices are registered to the volume that they form, the head's motion as
-/// one trajectory in acquisition order (see refine_poses), and the whole to a template, if there is one.
+/// Slices are registered to the volume that they form, the head's motion as one trajectory in acquisition order (see
+/// refine_poses), and the whole to a template, if there is one. No trained weights are needed. With those of the live
+/// network (NetworkGuide) a head that jumps is found where following loses it, and the canonical frame without a
+/// template.
 ///
 /// add() takes the new slice's pose from the head's motion at its neighbour in time and registers it, the newest slices
 /// and some of the older ones (IncrementalRefinement), or all slices (update "full"); finalise() registers all of them
@@ -24,15 +28,17 @@ class ScanSearch;
 /// lie elsewhere, in a thread of its own (EstimatorOptions::search_every).
 ///
 /// The brain frame begins with the scanner's axes at the brain's centre. A sure match with a template turns it into the
-/// canonical frame; that, and later corrections of it, are frame revisions, not motion. Between them the frame is held
-/// by the poses of the slices that are already there.
+/// canonical frame, or else the guide's votes do; that, and later corrections of it, are frame revisions, not motion.
+/// Between them the frame is held by the poses of the slices that are already there.
 class RegistrationEstimator : public IncrementalEstimator {
  public:
   /// @param templates brains in canonical orientation; may be empty
   /// @param source    more candidates for each new slice; may be null
+  /// @param guide     the live network; may be null
   /// @throws std::invalid_argument naming the option that is out of range
   RegistrationEstimator(const EstimatorOptions& options, std::vector<BrainTemplate> templates,
-                        std::unique_ptr<CandidateSource> source = nullptr);
+                        std::unique_ptr<CandidateSource> source = nullptr,
+                        std::unique_ptr<NetworkGuide> guide = nullptr);
   ~RegistrationEstimator() override;
 
   void add(const SliceSequence& sequence) override;
@@ -43,7 +49,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   const Estimate& estimate() const override { return estimate_; }
   const Volume& volume() const override { return volume_; }
   std::string device() const override { return "cpu"; }
-  EstimatorNotes notes() const override { return source_ ? source_->notes() : EstimatorNotes(); }
+  EstimatorNotes notes() const override;
 
  private:
   std::vector<Pose> crop_poses(const SliceSequence& sequence) const;
@@ -56,7 +62,9 @@ class RegistrationEstimator : public IncrementalEstimator {
   bool take_found(const SliceSequence& sequence);
   void take_uncertainty();
   void tell_incremental(const SliceSequence& sequence);
-  void align_to_template(const SliceSequence& sequence, const RegistrationInput& input);
+  void align(const SliceSequence& sequence, const RegistrationInput& input);
+  std::optional<Pose> canonical_frame(const SliceSequence& sequence, const RegistrationInput& input);
+  void propose_guided(const SliceSequence& sequence, std::size_t position, std::vector<PoseCandidate>* candidates);
   void move_frame(const Pose& T_new_old);
 
   EstimatorOptions options_;
@@ -64,6 +72,7 @@ class RegistrationEstimator : public IncrementalEstimator {
   ImageGrid grid_;
   std::vector<BrainTemplate> templates_;
   std::unique_ptr<CandidateSource> source_;
+  std::unique_ptr<NetworkGuide> guide_;
   std::unique_ptr<IncrementalRefinement> incremental_;  ///< null with update "full"
   std::unique_ptr<ScanSearch> search_;
   int search_pause_ = 1;        ///< EstimatorOptions::search_every times this lie between two searches

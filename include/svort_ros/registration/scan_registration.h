@@ -33,7 +33,8 @@ std::vector<Pose> assemble_stacks(const RegistrationInput& input, const std::vec
 /// and 16 times as much as RefinementOptions::image_trust. That takes several times as long. With one stack it is the
 /// answer of lowest cost.
 ///
-/// @param starts  at least one; each one pose per slice
+/// @param starts  at least one; each one pose per slice. The last one is also where stacks are put together from, and
+///                pieces are searched for
 /// @param stop    if not null, no further step (a refinement, the stacks' matching, a piece) is begun once this is set,
 ///                and the best until then is returned
 /// @throws std::invalid_argument naming what does not fit
@@ -46,11 +47,13 @@ Refinement register_scan(const RegistrationInput& input, const std::vector<std::
 /// is coarser), and quick if the pieces agree where they are.
 ///
 /// @param followed one pose per slice
+/// @param guess    the same, from elsewhere, tried before anything is searched for; or empty
 /// @param stop     if not null, the search gives up soon after this is set
 /// @return nothing if no poses are clearly better than `followed`, or fewer than 8 slices lie across the first stack
 ///         (the pieces of one stack agree anywhere); else poses in a frame of their own
 /// @throws std::invalid_argument naming what does not fit
-std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed, double size_mm,
+std::optional<Refinement> search_scan(const RegistrationInput& input, const std::vector<Pose>& followed,
+                                      const std::vector<Pose>& guess, double size_mm,
                                       const RefinementOptions& options = {}, const TemplateOptions& match = {},
                                       const std::atomic<bool>* stop = nullptr);
 

@@ -1,0 +1,94 @@
+#include "svort_ros/live/network_guide.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <utility>
+
+#include "estimator_network.h"
+#include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/live/network_input.h"
+
+namespace svort {
+namespace {
+
+constexpr const char* kWho = "estimator.network.guide";
+
+std::pair<NetworkInstance, Checkpoint> load(const NetworkEstimatorOptions& options) {
+  if (options.device == "cuda")
+    throw std::invalid_argument(std::string("estimator.network.device is 'cuda', but with ") + kWho +
+                                " the network runs on the CPU; auto or cpu will run");
+  if (options.device != "auto" && options.device != "cpu")
+    throw std::invalid_argument("estimator.network.device is '" + options.device + "'; known: auto, cpu, cuda");
+  return load_estimator_network(options, kWho);
+}
+
+std::vector<Pose> poses_of(const torch::Tensor& transforms) {
+  std::vector<Pose> poses;
+  for (std::int64_t i = 0; i < transforms.size(0); ++i) poses.push_back(pose_from_tensor(transforms[i]));
+  return poses;
+}
+
+}  // namespace
+
+NetworkGuide::NetworkGuide(const NetworkEstimatorOptions& options) {
+  const auto [network, about] = load(options);
+  *this = NetworkGuide(network, about);
+}
+
+NetworkGuide::NetworkGuide(const NetworkInstance& network, const Checkpoint& about)
+    : network_(std::dynamic_pointer_cast<LiveNetwork>(network.module)), notes_(network_notes(network, about)) {
+  if (!network_)
+    throw std::invalid_argument(std::string(kWho) + ": the network is '" + network.name +
+                                "'; only 'live' can guide registration");
+  network_->eval();
+}
+
+torch::Tensor NetworkGuide::features(const SliceSequence& sequence) {
+  std::map<std::shared_ptr<const PreparedSlice>, torch::Tensor> kept;
+  std::vector<torch::Tensor> rows;
+  for (const auto& slice : sequence.slices()) {
+    auto found = encoded_.find(slice);
+    if (found == encoded_.end()) {
+      torch::Tensor pixels = torch::empty({1, 1, slice->size, slice->size}, torch::kFloat32);
+      std::copy(slice->pixels.begin(), slice->pixels.end(), pixels.data_ptr<float>());
+      found = encoded_.emplace(slice, network_->encode(pixels, slice->resolution)).first;
+      ++count_;
+    }
+    rows.push_back(found->second);
+    kept.insert(*found);
+  }
+  encoded_ = std::move(kept);
+  return torch::cat(rows);
+}
+
+std::vector<Pose> NetworkGuide::place(const SliceSequence& sequence) {
+  const torch::NoGradGuard no_grad;
+  const NetworkInput input = network_geometry(sequence);
+  return poses_of(network_->place(features(sequence), input));
+}
+
+NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, const std::vector<Pose>& T_brain_crop) {
+  const torch::NoGradGuard no_grad;
+  if (T_brain_crop.size() != sequence.slices().size())
+    throw std::invalid_argument("NetworkGuide::find_frame: " + std::to_string(T_brain_crop.size()) + " poses for " +
+                                std::to_string(sequence.slices().size()) + " slices");
+  NetworkInput input = network_geometry(sequence);
+  // Around the middle of the slices' centres, about where the brain's is: what the network is trained on.
+  Eigen::Vector3d low = T_brain_crop.front().translation(), high = low;
+  for (const Pose& pose : T_brain_crop) {
+    low = low.cwiseMin(pose.translation());
+    high = high.cwiseMax(pose.translation());
+  }
+  Pose T_centred_brain = Pose::Identity();
+  T_centred_brain.translation() = -0.5 * (low + high);
+  for (std::size_t i = 0; i < T_brain_crop.size(); ++i) {
+    input.transforms[static_cast<std::int64_t>(i)].copy_(
+        tensor_from_pose(T_centred_brain * T_brain_crop[i]).squeeze(0));
+  }
+  const LiveFrame frame = network_->find_frame(features(sequence), input);
+  return {pose_from_tensor(frame.motion) * T_centred_brain, frame.agreement};
+}
+
+std::size_t NetworkGuide::take_encoded() { return std::exchange(count_, 0); }
+
+}  // namespace svort
