@@ -10,6 +10,7 @@
 
 #include "scored_poses.h"
 #include "svort_ros/geometry/rigid_transform.h"
+#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/network_input.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/metrics/image_similarity.h"
@@ -51,19 +52,41 @@ Answer nominal_answer(const RegistrationInput& input) {
   return {input.T_world_slice, std::vector<double>(input.count(), 1.), false, {}};
 }
 
-Answer refined_answer(const RegistrationInput& input, const Answer& start, const EstimatorOptions& options, bool search,
-                      bool* converged) {
-  const Refinement refined = search ? register_scan(input, {start.T_brain_crop}, options.volume_size_mm,
-                                                    options.registration, options.template_match)
-                                    : refine_poses(input, start.T_brain_crop, options.registration);
+Answer answer_of(const Refinement& refined, bool* converged) {
   Answer answer;
-  answer.canonical = start.canonical;
   for (const RefinedSlice& slice : refined.slices) {
     answer.T_brain_crop.push_back(slice.T_brain_slice);
     answer.weights.push_back(slice.weight);
   }
-  answer.T_brain_crop = without_drift(answer.T_brain_crop, start.T_brain_crop);
   *converged = refined.report.converged;
+  return answer;
+}
+
+Answer refined_answer(const RegistrationInput& input, const Answer& start, const EstimatorOptions& options,
+                      bool* converged) {
+  Answer answer = answer_of(refine_poses(input, start.T_brain_crop, options.registration), converged);
+  answer.canonical = start.canonical;
+  answer.T_brain_crop = without_drift(answer.T_brain_crop, start.T_brain_crop);
+  return answer;
+}
+
+/// The end of a scan, as the live system registers it.
+Answer searched_answer(const PartOfScan& part, const RegistrationInput& input, const TableMethod& method,
+                       const EstimatorOptions& options, bool* converged) {
+  std::vector<std::vector<Pose>> starts = {input.T_world_slice};
+  std::optional<NetworkGuide> guide;
+  if (!method.guide.empty()) {
+    NetworkEstimatorOptions network = options.network;
+    network.weights = method.guide;
+    guide.emplace(network);
+    starts.insert(starts.begin(), guide->place(part.sequence));
+  }
+  Answer answer = answer_of(
+      register_scan(input, starts, options.volume_size_mm, options.registration, options.template_match), converged);
+  if (!guide) return answer;
+  answer.T_brain_crop =
+      moved(guide->find_frame(part.sequence, answer.T_brain_crop).T_canonical_brain, answer.T_brain_crop);
+  answer.canonical = true;
   return answer;
 }
 
@@ -209,6 +232,8 @@ std::vector<TablePrefix> measure_prefixes(const TableKey& key, const EvaluationS
   if (method.source == PoseSource::registration) {
     PipelineOptions options = setup.pipeline;
     options.estimator.method = "registration";
+    options.estimator.network.guide = !method.guide.empty();
+    options.estimator.network.weights = method.guide;
     live.emplace(options);
   }
   for (std::size_t i = 0; i < scan.slices.size(); ++i) {
@@ -253,6 +278,8 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
   const bool network = method.source == PoseSource::network, registration = method.source == PoseSource::registration;
   if (!network && !registration && method.source != PoseSource::nominal)
     throw std::invalid_argument("measure_method: '" + method.name + "' must be nominal, registration or network");
+  if (!method.guide.empty() && !(registration && method.search))
+    throw std::invalid_argument("measure_method: '" + method.name + "' has a guide, but does not search");
   if (network && !method.network) throw std::invalid_argument("measure_method: '" + method.name + "' has no network");
   const EstimatorOptions& options = setup.pipeline.estimator;
   TableResult result;
@@ -268,7 +295,10 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
   // Poses, and the same after registration.
   const Stopwatch own_time;
   Answer answer = network ? network_answer(part, method, options) : nominal_answer(input);
-  if (registration) answer = refined_answer(input, answer, options, method.search, &score.converged);
+  if (registration) {
+    answer = method.search ? searched_answer(part, input, method, options, &score.converged)
+                           : refined_answer(input, answer, options, &score.converged);
+  }
   score.seconds = own_time.seconds();
   const ScoredAnswer own = score_answer(answer, part, input, setup);
   score.own = own.score;
@@ -279,7 +309,7 @@ TableResult measure_method(const EvaluationScan& scan, const TableMethod& method
     after = own;
   } else if (network && extent.refined) {
     const Stopwatch refined_time;
-    refined = refined_answer(input, answer, options, false, &score.converged);
+    refined = refined_answer(input, answer, options, &score.converged);
     score.refined_seconds = refined_time.seconds();
     after = score_answer(*refined, part, input, setup);
   }

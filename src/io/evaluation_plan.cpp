@@ -46,9 +46,10 @@ void check_row(const std::filesystem::path& file, const std::string& where, cons
   if (!holds(std::vector<std::string>{"", "positional_embedding", "volume"}, row.ablation))
     fail(file, name + ": ablation is '" + row.ablation + "'; it must be positional_embedding or volume");
   if (row.iterations < 0 || row.iterations > 100) fail(file, name + ": iterations must be 0 to 100");
-  if (row.poses != "network" &&
-      !(row.weights.empty() && row.network.empty() && row.ablation.empty() && row.iterations == 0))
-    fail(file, name + ": weights, network, ablation and iterations belong to rows with poses: network");
+  if (row.poses != "network" && row.poses != "search" && !(row.weights.empty() && row.network.empty()))
+    fail(file, name + ": weights and network belong to rows with poses: network or search");
+  if (row.poses != "network" && !(row.ablation.empty() && row.iterations == 0))
+    fail(file, name + ": ablation and iterations belong to rows with poses: network");
 }
 
 std::vector<std::string> split_names(const std::string& text) {
@@ -76,10 +77,11 @@ std::string ablation_of(const OptionValues& options) {
 TableRow load_row(const TablePlan& plan, const TableRowPlan& row, const RunnerOptions& runner) {
   TableRow result;
   result.method.name = row.name;
+  const bool guided = row.poses == "search" && !row.weights.empty();
   if (row.poses != "network") {
     result.method.source = row.poses == "nominal" ? PoseSource::nominal : PoseSource::registration;
     result.method.search = row.poses == "search";
-    return result;
+    if (!guided) return result;
   }
   if (row.weights.empty()) throw std::runtime_error("names no weights");
   Checkpoint about;
@@ -100,9 +102,15 @@ TableRow load_row(const TablePlan& plan, const TableRowPlan& row, const RunnerOp
   if (const auto [end, error] = std::from_chars(seen.data(), seen.data() + seen.size(), count);
       !seen.empty() && error == std::errc() && end == seen.data() + seen.size())
     result.scans_seen = count;
+  result.method.weights_sha256 = about.sha256;
+  if (guided) {
+    if (network.name != "live")
+      throw std::runtime_error(row.weights + ": holds network '" + network.name + "'; only 'live' guides registration");
+    result.method.guide = row.weights;
+    return result;
+  }
   result.method.source = PoseSource::network;
   result.method.iterations = row.iterations;
-  result.method.weights_sha256 = about.sha256;
   result.method.network = std::make_shared<NetworkRunner>(std::move(network), runner);
   return result;
 }

@@ -112,7 +112,7 @@ std::string training_notes(const TableRows& rows) {
     if (row.scans_seen && (most == nullptr || *row.scans_seen > *most->scans_seen)) most = &row;
   std::string text;
   for (const TableRow& row : rows.rows) {
-    if (!row.method.network) continue;
+    if (row.method.weights_sha256.empty()) continue;
     if (!row.scans_seen) {
       text += "* " + row.method.name + ": its weights do not say how many scans they were trained on.\n";
     } else if (*row.scans_seen < *most->scans_seen) {

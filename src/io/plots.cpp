@@ -270,8 +270,8 @@ void plot_volume_views(const std::filesystem::path& path, const Volume& volume, 
     left += kPanel + kGap;
   }
   put_text(image,
-           "R L A P S I: directions of the volume's frame (LPS). Without a template these are the scanner's, that is "
-           "the mother's, not the fetal head's.",
+           "R L A P S I: directions of the volume's frame (LPS). Without network and template these are the scanner's, "
+           "that is the mother's.",
            {kGap + 2, kTop + kPanel + 28}, 0.52, cv::Scalar(190, 190, 190));
   write_png(path, image);
 }

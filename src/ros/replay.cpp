@@ -240,6 +240,10 @@ int run_svort_replay(int argc, char** argv) {
   CLI::Option* weights = app.add_option(
       "--weights", network.weights,
       "run the network of this file (method network; with --estimator.network.candidate true: registration)");
+  std::string guide_weights;
+  CLI::Option* guide = app.add_option("--guide", guide_weights,
+                                      "weights of the live network that guides registration, e.g. models/live.pt");
+  guide->excludes(weights);
   CLI::Option* name =
       app.add_option("--network", network.name, "run this network (method network): v1, v2, ..; the file must hold it");
   app.add_option("--device", network.device, "where the network runs: auto, cpu or cuda; all else is on the CPU")
@@ -261,7 +265,11 @@ int run_svort_replay(int argc, char** argv) {
       throw std::invalid_argument("give either --bag or --stacks");
     if (!options.bag.empty() && !options.input.masks.empty())
       throw std::invalid_argument("--masks goes with --stacks; a bag holds its masks itself");
-    if (weights->count() + name->count() > 0 && !network.candidate)
+    if (guide->count() > 0) {
+      network.guide = true;
+      network.weights = guide_weights;
+    }
+    if (weights->count() + name->count() > 0 && !network.candidate && !network.guide)
       options.server.pipeline.estimator.method = "network";
     const svort::EstimatorOptions& estimator = options.server.pipeline.estimator;
     if (estimator.method != "network" && estimator.network.device == "cuda")

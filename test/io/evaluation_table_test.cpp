@@ -46,7 +46,8 @@ TEST_F(EvaluationTable, TheShippedTableHasThePapersRows) {
   std::vector<std::string> names;
   for (const TableRowPlan& row : shipped.rows) names.push_back(row.name);
   EXPECT_EQ(names, (std::vector<std::string>{"SVoRT (live)", "SVRnet", "PlaneInVol", "without PE", "without Vol",
-                                             "K = 1", "K = 2", "SVR only", "SVR with searches", "nominal"}));
+                                             "K = 1", "K = 2", "SVR only", "SVR with searches",
+                                             "SVR guided by SVoRT (live)", "nominal"}));
   EXPECT_EQ(shipped.seeds.size(), 4U);
   EXPECT_EQ(shipped.volumes.size(), 4U);
   EXPECT_EQ(shipped.rows[5].iterations, 1);
@@ -63,6 +64,8 @@ TEST_F(EvaluationTable, ErrorsNameTheFileAndTheKey) {
   EXPECT_TRUE(contains(error(volumes + "rows: [{name: a, poses: guess}]"), "poses is 'guess'"));
   EXPECT_TRUE(contains(error(volumes + "rows: [{name: a, ablation: x}]"), "ablation is 'x'"));
   EXPECT_TRUE(contains(error(volumes + "rows: [{name: a, poses: nominal, weights: w}]"), "belong to rows with poses"));
+  EXPECT_TRUE(
+      contains(error(volumes + "rows: [{name: a, poses: search, iterations: 2}]"), "belong to rows with poses"));
   EXPECT_TRUE(contains(error(volumes + "rows: [{name: a, wieghts: w}]"), "unknown key 'rows[0].wieghts'"));
   EXPECT_TRUE(contains(error(volumes + "rows: [{name: a}, {name: a}]"), "there are two rows 'a'"));
   EXPECT_TRUE(contains(error(volumes + row + "stacks: 4\n"), "stacks must be 1 to 3"));
@@ -85,9 +88,16 @@ TEST_F(EvaluationTable, RowsThatCannotBeMeasuredAreRefusedByName) {
                            "  - {name: not ablated, weights: " + usual + ", ablation: volume}\n" +               //
                            "  - {name: secretly ablated, weights: " + blind + "}\n" +                            //
                            "  - {name: nominal, poses: nominal}\n" +                                             //
-                           "  - {name: SVR, poses: registration}\n  - {name: searches, poses: search}\n"),
+                           "  - {name: SVR, poses: registration}\n  - {name: searches, poses: search}\n" +       //
+                           "  - {name: guided, poses: search, weights: " + usual + "}\n"),
                       {"cpu"});
-  ASSERT_EQ(rows.rows.size(), 5U);
+  ASSERT_EQ(rows.rows.size(), 6U);
+  EXPECT_EQ(rows.rows[5].method.source, PoseSource::registration);
+  EXPECT_TRUE(rows.rows[5].method.search);
+  EXPECT_EQ(rows.rows[5].method.guide, usual);
+  EXPECT_EQ(rows.rows[5].scans_seen, 4000);
+  EXPECT_EQ(rows.rows[5].method.weights_sha256.size(), 64U);
+  EXPECT_TRUE(rows.rows[4].method.guide.empty());
   EXPECT_EQ(rows.rows[3].method.source, PoseSource::registration);
   EXPECT_FALSE(rows.rows[3].method.search);
   EXPECT_EQ(rows.rows[4].method.source, PoseSource::registration);

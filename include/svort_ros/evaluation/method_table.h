@@ -18,9 +18,12 @@ struct TableMethod {
   std::string name;
   PoseSource source = PoseSource::network;  ///< nominal, registration or network
   bool search = false;                      ///< source registration: register_scan(), not refine_poses() alone
-  std::shared_ptr<NetworkRunner> network;   ///< of source network
-  int iterations = 0;                       ///< K of the network; 0: as many as it was made for
-  std::string weights_sha256;               ///< of the network's parameters; empty: none
+  /// Source registration, with search: weights of the live network that guides it and finds the canonical frame. Empty:
+  /// no network, and the frame is found with templates.
+  std::string guide;
+  std::shared_ptr<NetworkRunner> network;  ///< of source network
+  int iterations = 0;                      ///< K of the network; 0: as many as it was made for
+  std::string weights_sha256;              ///< of the network's parameters; empty: none
 };
 
 /// What is measured beside the poses' errors; each costs time.

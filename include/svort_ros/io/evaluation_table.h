@@ -17,7 +17,7 @@ struct TableRowPlan {
   /// network; registration (refinement from the scanner's poses); search (registration of the whole scan, with what is
   /// searched for at its end); or nominal (the scanner's poses)
   std::string poses = "network";
-  std::string weights;  ///< of a network: its file
+  std::string weights;  ///< of a network: its file; of a search: the live network that guides it
   std::string network;  ///< if not empty, the network that the file must hold
   /// What the network was trained without: "", "positional_embedding" or "volume". The file must say the same.
   std::string ablation;
@@ -27,7 +27,7 @@ struct TableRowPlan {
   void visit(Visitor&& v) {
     v("name", name, "of the row");
     v("poses", poses, "network, registration, search or nominal");
-    v("weights", weights, "file of the network's weights");
+    v("weights", weights, "file of the network's weights; of a search: of the live network that guides it");
     v("network", network, "if not empty, the network that the file must hold");
     v("ablation", ablation, "what the network was trained without: positional_embedding or volume");
     v("iterations", iterations, "transformation updates; 0: as many as the network was made for");
@@ -59,7 +59,8 @@ struct TablePlan {
 };
 
 /// @throws std::runtime_error naming the file and the key: what load_options() throws for, a row without a name or with
-///         one that is there already, an unknown kind of poses, weights without a network, values out of range
+///         one that is there already, an unknown kind of poses, weights of a row that has no network, values out of
+///         range
 TablePlan read_table_plan(const std::filesystem::path& file);
 
 /// A row that can be measured.
