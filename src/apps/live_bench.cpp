@@ -47,7 +47,7 @@ const char* const kLiveBenchUsage =
     "             is not ready after so many slices is waited for, so that with 0 arrivals take longer than they do "
     "live\n"
     "  --seed     of the simulated scan, default 1\n"
-    "  --weights  of the live network: lines with its answers as candidates, too, and the slices that it encodes per "
+    "  --weights  of the live network: lines of registration that it guides, too, and the slices that it encodes per "
     "arrival\n";
 
 namespace {
@@ -178,12 +178,12 @@ double rerun_ms(const LivePipeline& pipeline) {
   return milliseconds_since(start);
 }
 
-/// @param weights of the network whose answers are candidates; empty: none
+/// @param weights of the live network that guides registration; empty: none
 /// @param baseline of the other update; empty: none
 Baseline run(const Options& options, const std::string& update, const std::string& weights, const Baseline& baseline) {
   PipelineOptions pipeline_options;
   pipeline_options.estimator.update = update;
-  pipeline_options.estimator.network.candidate = !weights.empty();
+  pipeline_options.estimator.network.guide = !weights.empty();
   pipeline_options.estimator.network.weights = weights;
   if (!options.search) pipeline_options.estimator.search_every = 0;
   LivePipeline pipeline(pipeline_options);

@@ -5,7 +5,6 @@
 
 #include "svort_ros/live/network_candidates.h"
 #include "svort_ros/live/network_estimator.h"
-#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/nominal_estimator.h"
 #include "svort_ros/live/registration_estimator.h"
 

@@ -12,7 +12,6 @@
 
 #include "scan_search.h"
 #include "svort_ros/geometry/rigid_fit.h"
-#include "svort_ros/live/network_guide.h"
 #include "svort_ros/live/sequence_tensors.h"
 #include "svort_ros/live/volume_update.h"
 #include "svort_ros/registration/canonical_frame.h"
@@ -29,7 +28,6 @@ constexpr double kMovingMm = 2.;        // from slice to slice; a head that move
 constexpr int kLongestSearchPause = 4;
 constexpr double kBetterAgreement = 0.003;
 constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
-constexpr double kGuidedMm = 2.;     // closer to the prediction, registration ends where it does from there
 constexpr double kFrameDisagreement = 40. * M_PI / 180.;  // a template's match that lies so far off is not believed
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 
@@ -162,7 +160,6 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
     if (plane_distance(start(on), predicted, options_.registration.lever_mm) > kMovingMm)
       candidates.push_back({"motion goes on", start(on)});
   }
-  if (guide_ && incremental_->compares()) propose_guided(sequence, position, &candidates);
   if (source_) {
     for (PoseCandidate& candidate : source_->propose(sequence, position, *incremental_))
       candidates.push_back(std::move(candidate));
@@ -177,26 +174,6 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   take_incremental(sequence, position);
   idle_left_ = kIdleSweeps * incremental_->windows();
   idle_motion_mm_ = 0.;
-}
-
-void RegistrationEstimator::propose_guided(const SliceSequence& sequence, std::size_t position,
-                                           std::vector<PoseCandidate>* candidates) {
-  const std::vector<RefinedSlice>& engine = incremental_->slices();
-  const std::vector<Pose> placed = guide_->place(sequence);
-  std::vector<Pose> here, there;
-  for (std::size_t i = 0; i < engine.size(); ++i) {
-    if (i == position) continue;
-    here.push_back(placed[i]);
-    there.push_back(engine[i].T_brain_slice);
-  }
-  const double lever_mm = options_.registration.lever_mm;
-  const auto propose = [&](const Pose& T_engine_slice) {
-    if (plane_distance(T_engine_slice, candidates->front().T_brain_slice, lever_mm) > kGuidedMm)
-      candidates->push_back({"network", T_engine_slice});
-  };
-  // As all the others lie; and as the slice before does, which tells a jump best.
-  propose(fit_most_planes(here, there, half_field_mm(sequence)) * placed[position]);
-  if (position > 0) propose(engine[position - 1].T_brain_slice * placed[position - 1].inverse() * placed[position]);
 }
 
 void RegistrationEstimator::take_incremental(const SliceSequence& sequence, std::size_t newest) {

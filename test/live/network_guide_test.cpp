@@ -9,6 +9,7 @@
 #include "moving_scan.h"
 #include "network/small_networks.h"
 #include "svort_ros/geometry/rigid_fit.h"
+#include "svort_ros/live/registration_estimator.h"
 #include "svort_ros/network/deterministic_weights.h"
 
 namespace svort {

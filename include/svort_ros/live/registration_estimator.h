@@ -9,10 +9,10 @@
 #include "svort_ros/acquisition/slice_acquisition.h"
 #include "svort_ros/live/candidate_source.h"
 #include "svort_ros/live/incremental_estimator.h"
+#include "svort_ros/live/network_guide.h"
 
 namespace svort {
 
-class NetworkGuide;
 class ScanSearch;
 
 /// Slices are registered to the volume that they form, the head's motion as one trajectory in acquisition order (see
@@ -64,7 +64,6 @@ class RegistrationEstimator : public IncrementalEstimator {
   void tell_incremental(const SliceSequence& sequence);
   void align(const SliceSequence& sequence, const RegistrationInput& input);
   std::optional<Pose> canonical_frame(const SliceSequence& sequence, const RegistrationInput& input);
-  void propose_guided(const SliceSequence& sequence, std::size_t position, std::vector<PoseCandidate>* candidates);
   void move_frame(const Pose& T_new_old);
 
   EstimatorOptions options_;
