@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cstdio>
 #include <filesystem>
 #include <string>
@@ -64,7 +65,7 @@ TEST(RealScanGuide, FindsTheCanonicalFrameOfTheBundledScan) {
   EXPECT_LT(off.translation().norm(), 8.);
 }
 
-TEST(RealScanGuide, AHeadThatIsMadeToJumpIsFound) {
+TEST(RealScanGuide, RegistrationThatItGuidesFindsAHeadThatIsMadeToJump) {
   const std::vector<Slice> scan = real_scan();
   const std::vector<Pose> truth = registered(scan, false);
   // A scanner that turns about the brain is as good as a head that turns in the scanner.
@@ -86,8 +87,12 @@ TEST(RealScanGuide, AHeadThatIsMadeToJumpIsFound) {
   }
   const std::vector<Pose> guided = registered(jumped, true);
   ASSERT_EQ(guided.size(), truth.size());
-  std::printf("guided %.2f mm, without %.2f mm\n", relative_mm(guided, truth),
-              relative_mm(registered(jumped, false), truth));
+  std::vector<Pose> nominal;
+  for (const Slice& slice : jumped)
+    if (std::any_of(slice.mask.begin(), slice.mask.end(), [](auto value) { return value != 0; }))
+      nominal.push_back(slice.info.T_scanner_slice);
+  ASSERT_EQ(nominal.size(), truth.size());
+  EXPECT_GT(relative_mm(nominal, truth), 10.);
   EXPECT_LT(relative_mm(guided, truth), 2.);
 }
 
