@@ -27,7 +27,7 @@ constexpr std::size_t kIdleSweeps = 4;  // after a slice; what they have not mov
 constexpr double kMovingMm = 2.;        // from slice to slice; a head that moves less is at rest
 constexpr int kLongestSearchPause = 4;
 constexpr double kBetterAgreement = 0.003;
-constexpr double kElsewhereMm = 5.;  // what a search moves by more has been found elsewhere
+constexpr double kElsewhereMm = 5.;                       // what a search moves by more has been found elsewhere
 constexpr double kFrameDisagreement = 40. * M_PI / 180.;  // a template's match that lies so far off is not believed
 constexpr double kFrameAngle = 3. * M_PI / 180., kFrameShiftMm = 3.;  // smaller corrections are not worth a revision
 

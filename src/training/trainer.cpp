@@ -164,8 +164,8 @@ std::map<std::string, double> Trainer::step() {
     const std::size_t count = std::min(at_once, scans.size() - begin);
     const auto first = scans.begin() + static_cast<std::ptrdiff_t>(begin);
     const double share = static_cast<double>(count) / static_cast<double>(scans.size());
-    const StepLoss loss =
-        recipe_->loss({first, first + static_cast<std::ptrdiff_t>(count)}, static_cast<std::uint64_t>(first_scan_ + number));
+    const StepLoss loss = recipe_->loss({first, first + static_cast<std::ptrdiff_t>(count)},
+                                        static_cast<std::uint64_t>(first_scan_ + number));
     usable = std::isfinite(loss.total.item<double>());
     if (usable) (loss.total * share).backward();
     for (const auto& [name, value] : loss.parts) parts[name] += share * value;
@@ -245,9 +245,9 @@ void Trainer::save() const {
   archive.write("network", network);
   archive.write("optimizer", optimizer);
   for (std::size_t i = 0; i < average_.size(); ++i) archive.write("average_" + std::to_string(i), average_[i]);
-  archive.write("counters",
-                torch::tensor({progress_.step, progress_.scans, progress_.skipped, options_.seed, first_scan_},
-                              torch::kInt64));
+  archive.write(
+      "counters",
+      torch::tensor({progress_.step, progress_.scans, progress_.skipped, options_.seed, first_scan_}, torch::kInt64));
   archive.write("seconds", torch::tensor({progress_.seconds}, torch::kFloat64));
   archive.save_to(temporary.string());
   std::filesystem::rename(temporary, path);

@@ -34,6 +34,7 @@ AccuracyRow row(const std::string& method, std::uint64_t number, double relative
   result.atlas.ed_mm = 2. * relative;
   result.atlas.frame_rad = relative > 5. ? 3. : 0.1;
   result.atlas.sure = true;
+  if (method == "guided") result.guide = result.atlas;
   result.seconds = 1.25;
   result.converged = false;
   return result;
@@ -102,9 +103,13 @@ TEST_F(AccuracyTable, NamesTheLineThatIsWrong) {
 TEST_F(AccuracyTable, TablesHoldMeanMedianAndTurnedFrames) {
   const std::string table =
       accuracy_markdown({row("nominal", 1, 1.), row("nominal", 2, 2.), row("nominal", 3, 9.), row("live", 1, 0.5)});
-  EXPECT_NE(table.find("| mild | nominal | 3 | 4.00 / 2.00 | - | 8.00 / 4.00 | - | 1 (1 sure) | - | - | 1.2"),
-            std::string::npos)
+  EXPECT_NE(
+      table.find("| mild | nominal | 3 | 4.00 / 2.00 | - | 8.00 / 4.00 | - | 1 (1 sure) | - | - | - | - | - | 1.2"),
+      std::string::npos)
       << table;
+  EXPECT_NE(
+      accuracy_markdown({row("guided", 1, 1.5)}).find("| 3.00 / 3.00 | - | 0 | - | - | 3.00 / 3.00 | - | 0 | 1.2"),
+      std::string::npos);
   EXPECT_NE(table.find("| mild | live | 1 | 0.50 / 0.50 |"), std::string::npos) << table;
 }
 

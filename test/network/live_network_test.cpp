@@ -188,8 +188,7 @@ TEST(LiveNetwork, GradientsReachEveryParameter) {
   randomise(network);
   const NetworkInput input = random_input(6);
   const auto first = network.attend(network.encode(input.slices, 2.), input);
-  const auto shared =
-      network.update(torch::rand({6, svort::kLiveSimulatedChannels, 64, 64}), random_pulls(6), input);
+  const auto shared = network.update(torch::rand({6, svort::kLiveSimulatedChannels, 64, 64}), random_pulls(6), input);
   (first.points.square().sum() + first.mirrored.square().sum() + first.log_scale.square().sum() +
    first.quality.square().sum() + shared.points.square().sum() + shared.log_scale.square().sum() +
    shared.quality.square().sum())
@@ -272,8 +271,8 @@ TEST(LiveNetwork, AblationsAreWhatTheirNamesSay) {
   LiveNetwork unpulled(options);
   EXPECT_FALSE(unpulled.named_parameters().contains("shared_pulls.weight"));
   const auto untrained = unpulled.run(input, {{32, 32, 32}, 4.}, run);
-  const svort::PoseErrors moved = svort::relative_pose_errors(untrained[1].transforms, untrained[0].transforms,
-                                                              svort::live_anchor_frame(options));
+  const svort::PoseErrors moved =
+      svort::relative_pose_errors(untrained[1].transforms, untrained[0].transforms, svort::live_anchor_frame(options));
   EXPECT_LT(moved.ed.max().item<double>(), 0.01) << "without pulls slices stay, but for the frame";
 }
 
@@ -317,8 +316,8 @@ TEST(LiveNetwork, AnUntrainedUpdateGoesWhereImagesPull) {
   EXPECT_LT(after(pulls), 0.6 * before);
   EXPECT_NEAR(after({}), before, 1e-3) << "not told of pulls, it stays";
   // What the whole has drifted by is taken out.
-  const torch::Tensor moved = svort::apply_live_update(
-      head.input.transforms, pulls.points.select(1, svort::kLivePulls - 1), network.options());
+  const torch::Tensor moved =
+      svort::apply_live_update(head.input.transforms, pulls.points.select(1, svort::kLivePulls - 1), network.options());
   const auto centre = [](const torch::Tensor& transforms) {
     return svort::transform_points(transforms, torch::zeros({transforms.size(0), 3})).mean(0);
   };
