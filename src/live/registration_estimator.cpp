@@ -420,10 +420,8 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::a
 }
 
 EstimatorNotes RegistrationEstimator::notes() const {
-  EstimatorNotes notes = source_ ? source_->notes() : EstimatorNotes();
-  if (!guide_) return notes;
-  // Both come from the same file.
-  return guide_->notes();
+  if (guide_) return guide_->notes();  // of the same file as the source's
+  return source_ ? source_->notes() : EstimatorNotes();
 }
 
 void RegistrationEstimator::reset() {
