@@ -184,13 +184,12 @@ AccuracyRow measure_accuracy(const EvaluationScan& scan, const PoseMethod& metho
     RefinementOptions refinement = options.estimator.registration;
     if (method.source == PoseSource::stacks) refinement.trajectory_passes = 0;
     const std::vector<Pose> start = crops;
-    std::vector<std::vector<Pose>> starts = {start};
-    if (guide) starts.insert(starts.begin(), guide->place(sequence));
     // From the scanner's poses the stacks may be anywhere; from a network's or for the stack stage, these poses count.
-    const Refinement refined = method.source == PoseSource::registration
-                                   ? register_scan(input, starts, options.estimator.volume_size_mm, refinement,
-                                                   options.estimator.template_match)
-                                   : refine_poses(input, start, refinement);
+    const Refinement refined =
+        method.source == PoseSource::registration
+            ? register_scan(input, registration_starts(input, guide ? &*guide : nullptr, sequence),
+                            options.estimator.volume_size_mm, refinement, options.estimator.template_match)
+            : refine_poses(input, start, refinement);
     crops.clear();
     for (std::size_t i = 0; i < row.slices; ++i) {
       crops.push_back(refined.slices[i].T_brain_slice);

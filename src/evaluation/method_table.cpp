@@ -73,14 +73,13 @@ Answer refined_answer(const RegistrationInput& input, const Answer& start, const
 /// The end of a scan, as the live system registers it.
 Answer searched_answer(const PartOfScan& part, const RegistrationInput& input, const TableMethod& method,
                        const EstimatorOptions& options, bool* converged) {
-  std::vector<std::vector<Pose>> starts = {input.T_world_slice};
   std::optional<NetworkGuide> guide;
   if (!method.guide.empty()) {
     NetworkEstimatorOptions network = options.network;
     network.weights = method.guide;
     guide.emplace(network);
-    starts.insert(starts.begin(), guide->place(part.sequence));
   }
+  const auto starts = registration_starts(input, guide ? &*guide : nullptr, part.sequence);
   Answer answer = answer_of(
       register_scan(input, starts, options.volume_size_mm, options.registration, options.template_match), converged);
   if (!guide) return answer;

@@ -16,6 +16,14 @@ std::pair<NetworkInstance, Checkpoint> load_estimator_network(const NetworkEstim
   return {std::move(network), std::move(about)};
 }
 
+void require_cpu(const NetworkEstimatorOptions& options, const char* who) {
+  if (options.device == "cuda")
+    throw std::invalid_argument(std::string("estimator.network.device is 'cuda', but with ") + who +
+                                " the network runs on the CPU; auto or cpu will run");
+  if (options.device != "auto" && options.device != "cpu")
+    throw std::invalid_argument("estimator.network.device is '" + options.device + "'; known: auto, cpu, cuda");
+}
+
 AcquisitionFormulation network_formulation(const NetworkEstimatorOptions& options) {
   try {
     return acquisition_formulation(options.formulation);

@@ -13,6 +13,10 @@ namespace svort {
 /// @throws std::runtime_error naming the file and what is wrong with it
 std::pair<NetworkInstance, Checkpoint> load_estimator_network(const NetworkEstimatorOptions& options, const char* who);
 
+/// @param who runs its network on the CPU alone
+/// @throws std::invalid_argument if the options name another device
+void require_cpu(const NetworkEstimatorOptions& options, const char* who);
+
 /// @throws std::invalid_argument naming the option
 AcquisitionFormulation network_formulation(const NetworkEstimatorOptions& options);
 

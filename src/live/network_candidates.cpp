@@ -35,11 +35,7 @@ NetworkCandidates::NetworkCandidates(const NetworkEstimatorOptions& options, con
   if (!module_)
     throw std::invalid_argument(std::string(kWho) + ": the network is '" + network.name +
                                 "'; only 'live' can be asked about one slice after another");
-  if (options.device == "cuda")
-    throw std::invalid_argument(std::string("estimator.network.device is 'cuda', but with ") + kWho +
-                                " the network runs on the CPU; auto or cpu will run");
-  if (options.device != "auto" && options.device != "cpu")
-    throw std::invalid_argument("estimator.network.device is '" + options.device + "'; known: auto, cpu, cuda");
+  require_cpu(options, kWho);
   if (options.precision != "float32" && options.precision != "bfloat16")
     throw std::invalid_argument("estimator.network.precision is '" + options.precision + "'; with " + kWho +
                                 " it may be float32 or bfloat16");

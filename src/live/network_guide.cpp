@@ -14,11 +14,7 @@ namespace {
 constexpr const char* kWho = "estimator.network.guide";
 
 std::pair<NetworkInstance, Checkpoint> load(const NetworkEstimatorOptions& options) {
-  if (options.device == "cuda")
-    throw std::invalid_argument(std::string("estimator.network.device is 'cuda', but with ") + kWho +
-                                " the network runs on the CPU; auto or cpu will run");
-  if (options.device != "auto" && options.device != "cpu")
-    throw std::invalid_argument("estimator.network.device is '" + options.device + "'; known: auto, cpu, cuda");
+  require_cpu(options, kWho);
   return load_estimator_network(options, kWho);
 }
 
@@ -90,5 +86,13 @@ NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, cons
 }
 
 std::size_t NetworkGuide::take_encoded() { return std::exchange(count_, 0); }
+
+std::vector<std::vector<Pose>> registration_starts(const RegistrationInput& input, NetworkGuide* guide,
+                                                   const SliceSequence& sequence) {
+  std::vector<std::vector<Pose>> starts;
+  if (guide != nullptr) starts.push_back(guide->place(sequence));
+  starts.push_back(input.T_world_slice);
+  return starts;
+}
 
 }  // namespace svort

@@ -400,10 +400,8 @@ void RegistrationEstimator::finalise(const SliceSequence& sequence, const std::a
     const std::vector<Pose> current = crop_poses(sequence);
     // From the scanner's poses, and from where the network places the slices, so that the end does not depend on the
     // way; `take` brings it into the frame that is there.
-    std::vector<std::vector<Pose>> starts = {input.T_world_slice};
-    if (guide_) starts.insert(starts.begin(), guide_->place(sequence));
-    const Refinement end =
-        register_scan(input, starts, options_.volume_size_mm, options_.registration, options_.template_match, stop);
+    const Refinement end = register_scan(input, registration_starts(input, guide_.get(), sequence),
+                                         options_.volume_size_mm, options_.registration, options_.template_match, stop);
     if (stop && stop->load()) return;
     take(sequence, end, current);
     if (incremental_) {

@@ -11,6 +11,7 @@
 #include "svort_ros/live/incremental_estimator.h"
 #include "svort_ros/network/checkpoint.h"
 #include "svort_ros/network/live_network.h"
+#include "svort_ros/registration/registration_input.h"
 #include "svort_ros/sequence/slice_sequence.h"
 
 namespace svort {
@@ -59,5 +60,12 @@ class NetworkGuide {
   std::map<std::shared_ptr<const PreparedSlice>, torch::Tensor> encoded_;
   std::size_t count_ = 0;
 };
+
+/// Where register_scan() of the sequence starts: from where the guide places the slices, if there is one, and from the
+/// scanner's poses.
+/// @param input registration_input() of the sequence
+/// @param guide may be null
+std::vector<std::vector<Pose>> registration_starts(const RegistrationInput& input, NetworkGuide* guide,
+                                                   const SliceSequence& sequence);
 
 }  // namespace svort
