@@ -11,6 +11,7 @@
 
 #include "svort_ros/network/checkpoint.h"
 #include "svort_ros/network/deterministic_weights.h"
+#include "svort_ros/network/join_networks.h"
 #include "svort_ros/network/network_registry.h"
 
 namespace {
@@ -19,9 +20,13 @@ constexpr const char* kUsage =
     "usage: svort_checkpoint info FILE\n"
     "       svort_checkpoint parameters NETWORK\n"
     "       svort_checkpoint untrained NETWORK FILE\n"
+    "       svort_checkpoint join FIRST SHARED FILE\n"
     "  info        checks a file completely (hash, network, options, every parameter) and prints what it says\n"
     "  parameters  names and shapes of a network's parameters, as JSON\n"
-    "  untrained   writes v1 or v2 with weights that follow from a rule: to test programs, not to register anything\n";
+    "  untrained   writes v1 or v2 with weights that follow from a rule: to test programs, not to register anything\n"
+    "  join        writes a live network with the first network of one file and the shared network of the other, "
+    "which\n"
+    "              were trained apart (docs/training.md)\n";
 
 struct UsageError : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -68,6 +73,11 @@ void write_untrained(const std::string& name, const std::string& file) {
   svort::save_network(file, network, {{"untrained", "weights follow from a rule and have learnt nothing"}});
 }
 
+void join(const std::string& first, const std::string& shared, const std::string& file) {
+  const svort::JoinedNetwork joined = svort::join_live_networks(first, shared);
+  svort::save_network(file, joined.network, joined.provenance, svort::WeightPrecision::half);
+}
+
 void run(const std::vector<std::string>& arguments) {
   const std::string command = arguments.empty() ? "" : arguments[0];
   if (command == "info" && arguments.size() == 2)
@@ -76,6 +86,8 @@ void run(const std::vector<std::string>& arguments) {
     print_parameters(arguments[1]);
   else if (command == "untrained" && arguments.size() == 3)
     write_untrained(arguments[1], arguments[2]);
+  else if (command == "join" && arguments.size() == 4)
+    join(arguments[1], arguments[2], arguments[3]);
   else
     throw UsageError(command.empty() ? "a command is missing" : "'" + command + "' is unknown, or its arguments are");
 }

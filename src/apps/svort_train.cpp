@@ -30,7 +30,6 @@ std::string names_of(const std::vector<BrainVolume>& volumes) {
 
 constexpr const char* kStartedFrom = "started from";
 constexpr const char* kStartedAnew = "started anew";  // parameters that those weights did not have
-constexpr const char* kScansBefore = "scans before";  // seen by the weights that training started from
 
 // The moving average of the weights, in the file that the node and the replay take.
 void write_weights(const std::filesystem::path& folder, const NetworkInstance& network, const Trainer& trainer,
@@ -43,9 +42,8 @@ void write_weights(const std::filesystem::path& folder, const NetworkInstance& n
   }
   const TrainingProgress& progress = trainer.progress();
   provenance["steps"] = std::to_string(progress.step);
-  const auto before = provenance.find(kScansBefore);
-  const std::int64_t started_with = before == provenance.end() ? 0 : std::stoll(before->second);
-  provenance["scans"] = std::to_string(started_with + progress.scans);
+  const std::int64_t before = scans_seen(provenance, folder / "weights.pt", kProvenanceScansBefore).value_or(0);
+  provenance[kProvenanceScans] = std::to_string(before + progress.scans);
   provenance["steps skipped"] = std::to_string(progress.skipped);
   provenance["seconds"] = std::to_string(static_cast<std::int64_t>(progress.seconds));
   save_network(folder / "weights.pt", averaged, provenance, WeightPrecision::half);
@@ -74,7 +72,7 @@ std::shared_ptr<TrainingRecipe> recipe_of(const TrainingConfig& config, const Ne
 void take_over_start(const std::filesystem::path& weights, Provenance* provenance) {
   if (!std::filesystem::exists(weights)) return;
   const Provenance before = read_checkpoint(weights).provenance;
-  for (const char* key : {kStartedFrom, kScansBefore, kStartedAnew})
+  for (const char* key : {kStartedFrom, kProvenanceScansBefore, kStartedAnew})
     if (const auto found = before.find(key); found != before.end()) (*provenance)[key] = found->second;
 }
 
@@ -151,11 +149,10 @@ int run(int argc, char** argv) {
     const Checkpoint before = read_checkpoint(weights);
     if (before.network != config.kind)
       throw std::invalid_argument(weights + ": holds the network '" + before.network + "', not '" + config.kind + "'");
-    const auto scans = before.provenance.find("scans");
-    const std::string seen = scans == before.provenance.end() ? "0" : scans->second;
-    const std::vector<std::string> left = trainer.start_from(before.parameters, std::stoll(seen));
-    provenance[kStartedFrom] = "weights " + before.sha256 + ", after " + seen + " scans";
-    provenance[kScansBefore] = seen;
+    const std::int64_t seen = scans_seen(before.provenance, weights).value_or(0);
+    const std::vector<std::string> left = trainer.start_from(before.parameters, seen);
+    provenance[kStartedFrom] = "weights " + before.sha256 + ", after " + std::to_string(seen) + " scans";
+    provenance[kProvenanceScansBefore] = std::to_string(seen);
     if (!left.empty()) {
       std::string names;
       for (const std::string& name : left) names += (names.empty() ? "" : ", ") + name;

@@ -174,4 +174,19 @@ Pose pose_from_tensor(const torch::Tensor& matrix) {
   return pose_from_trans_first(trans_first);
 }
 
+torch::Tensor tensor_from_poses(const std::vector<Pose>& poses) {
+  torch::Tensor tensor = torch::empty({static_cast<std::int64_t>(poses.size()), 3, 4}, torch::kFloat32);
+  for (std::size_t i = 0; i < poses.size(); ++i)
+    tensor[static_cast<std::int64_t>(i)] = tensor_from_pose(poses[i]).squeeze(0);
+  return tensor;
+}
+
+std::vector<Pose> poses_from_tensor(const torch::Tensor& matrices) {
+  check_batch(matrices, {3, 4}, "poses_from_tensor", "matrices");
+  std::vector<Pose> poses;
+  const torch::Tensor host = matrices.detach().to(torch::kCPU);
+  for (std::int64_t i = 0; i < host.size(0); ++i) poses.push_back(pose_from_tensor(host[i]));
+  return poses;
+}
+
 }  // namespace svort

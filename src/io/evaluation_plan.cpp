@@ -1,7 +1,6 @@
 // What a table of methods consists of: its file, its networks.
 
 #include <algorithm>
-#include <charconv>
 #include <memory>
 #include <set>
 #include <sstream>
@@ -97,11 +96,7 @@ TableRow load_row(const TablePlan& plan, const TableRowPlan& row, const RunnerOp
     for (const std::string& tested : plan.volumes)
       if (volume_name(tested) == trained)
         throw std::runtime_error(row.weights + ": was trained on " + trained + ", which the table tests");
-  const std::string& seen = about.provenance["scans"];
-  std::int64_t count = 0;
-  if (const auto [end, error] = std::from_chars(seen.data(), seen.data() + seen.size(), count);
-      !seen.empty() && error == std::errc() && end == seen.data() + seen.size())
-    result.scans_seen = count;
+  result.scans_seen = scans_seen(about.provenance, row.weights);
   result.method.weights_sha256 = about.sha256;
   if (guided) {
     if (network.name != "live")

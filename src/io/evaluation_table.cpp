@@ -321,11 +321,12 @@ void measure_table(const TableRun& run) {
   TaskClock clock(plan.seeds.size() * static_cast<std::size_t>(plan.scans) * plan.motions.size() * brains.size() *
                   static_cast<std::size_t>(plan.stacks) * rows.rows.size());
   bool first = true;
-  for (const std::uint64_t seed : plan.seeds)
-    for (int scan = 0; scan < plan.scans; ++scan)
-      for (const std::string& motion : plan.motions)
-        for (std::size_t b = 0; b < brains.size(); ++b) {
-          for (int stacks = plan.stacks; stacks >= 1; --stacks) {
+  // What the table itself needs comes first, then, for a figure, the same scans with fewer stacks.
+  for (int stacks = plan.stacks; stacks >= 1; --stacks)
+    for (const std::uint64_t seed : plan.seeds)
+      for (int scan = 0; scan < plan.scans; ++scan)
+        for (const std::string& motion : plan.motions)
+          for (std::size_t b = 0; b < brains.size(); ++b) {
             EvaluationScanOptions options;
             options.motion = motion;
             options.protocol = plan.protocol;
@@ -350,10 +351,9 @@ void measure_table(const TableRun& run) {
               scores.add({result.score});
               say(result.score, clock.next());
             }
+            first = false;
+            write();
           }
-          first = false;
-          write();
-        }
   write();
 }
 

@@ -18,12 +18,6 @@ std::pair<NetworkInstance, Checkpoint> load(const NetworkEstimatorOptions& optio
   return load_estimator_network(options, kWho);
 }
 
-std::vector<Pose> poses_of(const torch::Tensor& transforms) {
-  std::vector<Pose> poses;
-  for (std::int64_t i = 0; i < transforms.size(0); ++i) poses.push_back(pose_from_tensor(transforms[i]));
-  return poses;
-}
-
 }  // namespace
 
 NetworkGuide::NetworkGuide(const NetworkEstimatorOptions& options) {
@@ -60,7 +54,7 @@ torch::Tensor NetworkGuide::features(const SliceSequence& sequence) {
 std::vector<Pose> NetworkGuide::place(const SliceSequence& sequence) {
   const torch::NoGradGuard no_grad;
   const NetworkInput input = network_geometry(sequence);
-  return poses_of(network_->place(features(sequence), input));
+  return poses_from_tensor(network_->place(features(sequence), input));
 }
 
 NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, const std::vector<Pose>& T_brain_crop) {

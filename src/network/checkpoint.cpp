@@ -2,6 +2,7 @@
 
 #include <torch/serialize.h>
 
+#include <charconv>
 #include <fstream>
 #include <iterator>
 #include <sstream>
@@ -228,5 +229,17 @@ NetworkInstance load_network(const std::filesystem::path& file, Checkpoint* chec
 }
 
 bool is_untrained(const Provenance& provenance) { return provenance.count("untrained") > 0; }
+
+std::optional<std::int64_t> scans_seen(const Provenance& provenance, const std::filesystem::path& file,
+                                       const char* key) {
+  const auto entry = provenance.find(key);
+  if (entry == provenance.end()) return std::nullopt;
+  const std::string& text = entry->second;
+  std::int64_t scans = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), scans);
+  if (error != std::errc() || end != text.data() + text.size() || scans < 0)
+    fail(file, std::string("its provenance gives '") + text + "' under '" + key + "', which is no number of scans");
+  return scans;
+}
 
 }  // namespace svort

@@ -15,12 +15,6 @@
 namespace svort {
 namespace {
 
-torch::Tensor tensor_from_poses(const std::vector<Pose>& poses) {
-  std::vector<torch::Tensor> rows;
-  for (const Pose& pose : poses) rows.push_back(tensor_from_pose(pose));
-  return torch::cat(rows);
-}
-
 /// Mean over the slice's own pixels of how much its simulated image changed, over the slice's mean intensity.
 double change_of_view(const torch::Tensor& reduced, const torch::Tensor& before, const torch::Tensor& now) {
   const torch::Tensor brain = reduced > 0;

@@ -495,9 +495,9 @@ LivePulls pull_live_slices(const torch::Tensor& reduced, const NetworkInput& inp
   scan.thickness_mm.assign(n, input.thickness_mm);
   const torch::Tensor transforms = input.transforms.detach().cpu();
   const torch::Tensor stacks = input.positions.select(1, 1).cpu().round(), times = input.times.cpu();
+  scan.T_world_slice = poses_from_tensor(transforms);
   for (std::size_t i = 0; i < n; ++i) {
     const auto row = static_cast<std::int64_t>(i);
-    scan.T_world_slice.push_back(pose_from_tensor(transforms[row]));
     scan.stack.push_back(static_cast<int>(stacks[row].item<float>()));
     scan.time_s.push_back(times[row].item<float>());
   }
@@ -522,9 +522,8 @@ LivePulls pull_live_slices(const torch::Tensor& reduced, const NetworkInput& inp
     if (correlations.size() == 1) continue;  // nothing has moved yet
     // Registration sees relative motion alone: what the whole has drifted by means nothing.
     const Pose held = fit_planes(poses, scan.T_world_slice, half_field_mm);
-    std::vector<torch::Tensor> places;
-    for (const Pose& pose : poses) places.push_back(tensor_from_pose(held * pose));
-    const torch::Tensor moved = compose_transforms(here, torch::cat(places));
+    for (Pose& pose : poses) pose = held * pose;
+    const torch::Tensor moved = compose_transforms(here, tensor_from_poses(poses));
     points.push_back(anchor_points_from_matrix(moved, frame) / kLiveUpdateUnitMm - rest);
   }
   return {torch::stack(points, 1).to(device), torch::stack(correlations, 1).to(device)};

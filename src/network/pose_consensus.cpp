@@ -202,13 +202,6 @@ std::size_t slices_of(const std::vector<Vote>& votes, const torch::Tensor& motio
   return static_cast<std::size_t>(motions.size(0));
 }
 
-torch::Tensor tensor_of(const std::vector<Pose>& motions) {
-  torch::Tensor result = torch::empty({static_cast<std::int64_t>(motions.size()), 3, 4});
-  for (std::size_t i = 0; i < motions.size(); ++i)
-    result[static_cast<std::int64_t>(i)] = tensor_from_pose(motions[i])[0];
-  return result;
-}
-
 /// Half the weighted squared distance of points, in the six numbers of motion() that moves `from`.
 void add_points(const Points& from, const Points& to, double weight, SliceTerms* terms) {
   for (int point = 0; point < 3; ++point) {
@@ -252,7 +245,7 @@ torch::Tensor pose_consensus(const PoseVotes& votes, const ConsensusOptions& opt
     for (const std::int64_t i : slices) motions[static_cast<std::size_t>(i)] = motion;
   }
 
-  return tensor_of(motions);
+  return tensor_from_poses(motions);
 }
 
 torch::Tensor trajectory_consensus(const PoseVotes& votes, const torch::Tensor& start,
@@ -270,8 +263,7 @@ torch::Tensor trajectory_consensus(const PoseVotes& votes, const torch::Tensor& 
   std::vector<std::int64_t> stack(n);
   for (std::size_t i = 0; i < n; ++i) stack[i] = votes.stack[static_cast<std::int64_t>(i)].item<std::int64_t>();
 
-  std::vector<Pose> motions;
-  for (std::size_t i = 0; i < n; ++i) motions.push_back(pose_from_tensor(start[static_cast<std::int64_t>(i)]));
+  std::vector<Pose> motions = poses_from_tensor(start);
   double robust = kWideRobust * options.robust_mm, rest_mm = kWideRestMm;
   for (int step = 0; step < kSteps; ++step) {
     std::vector<SliceTerms> terms(n);
@@ -312,14 +304,13 @@ torch::Tensor trajectory_consensus(const PoseVotes& votes, const torch::Tensor& 
     rest_mm = std::max(kRestMm, kRestFactor * rest_mm);
     if (step >= kSettled && largest < kSettledMm) break;
   }
-  return tensor_of(motions);
+  return tensor_from_poses(motions);
 }
 
 double vote_agreement(const PoseVotes& votes, const torch::Tensor& motions, const ConsensusOptions& options) {
   const std::vector<Vote> all = checked_votes(votes, options);
   const std::size_t n = slices_of(all, motions);
-  std::vector<Pose> poses;
-  for (std::size_t i = 0; i < n; ++i) poses.push_back(pose_from_tensor(motions[static_cast<std::int64_t>(i)]));
+  const std::vector<Pose> poses = poses_from_tensor(motions);
   const double squared = options.robust_mm * options.robust_mm;
   std::size_t asked = 0, agree = 0;
   for (std::size_t k = 0; k < all.size(); ++k) {

@@ -9,7 +9,9 @@
 #include <sstream>
 #include <stdexcept>
 
+#include "head_rim.h"
 #include "purposes.h"
+#include "smooth_fields.h"
 #include "svort_ros/simulation/random_stream.h"
 
 namespace svort {
@@ -26,33 +28,6 @@ void require(bool ok, const char* option, double value, const char* limit) {
   throw std::invalid_argument(text.str());
 }
 
-/// out x in matrix that low-passes and samples one axis. Positions are index * spacing + first, mm.
-torch::Tensor axis_filter(std::int64_t in, double in_first, double in_mm, std::int64_t out, double out_first,
-                          double out_mm, double sigma_mm) {
-  const torch::Tensor from = torch::arange(in, torch::kFloat64) * in_mm + in_first;
-  const torch::Tensor to = torch::arange(out, torch::kFloat64) * out_mm + out_first;
-  const torch::Tensor distance = (to.unsqueeze(1) - from.unsqueeze(0)).abs();
-  // A Gaussian much narrower than a voxel would pick single voxels: interpolate linearly then.
-  const torch::Tensor weights = sigma_mm < 0.35 * in_mm ? (1. - distance / in_mm).clamp_min(0.)
-                                                        : torch::exp(-0.5 * torch::pow(distance / sigma_mm, 2));
-  return (weights / weights.sum(1, true).clamp_min(1e-6)).to(torch::kFloat32);
-}
-
-/// Applies one matrix per axis (z, y, x) to c x d x h x w.
-torch::Tensor apply_axes(const torch::Tensor& volume, const std::array<torch::Tensor, 3>& axes) {
-  torch::Tensor result = torch::matmul(volume, axes[2].t());
-  result = torch::matmul(axes[1], result);
-  return torch::matmul(axes[0], result.transpose(1, 2)).transpose(1, 2);
-}
-
-/// Uniform cubic B-spline.
-double b_spline(double t) {
-  t = std::abs(t);
-  if (t < 1.) return 2. / 3. - t * t + 0.5 * t * t * t;
-  if (t < 2.) return (2. - t) * (2. - t) * (2. - t) / 6.;
-  return 0.;
-}
-
 float quantile_within(const torch::Tensor& image, const torch::Tensor& mask, double quantile) {
   const torch::Tensor values = std::get<0>(image.masked_select(mask).sort());
   const auto rank = static_cast<std::int64_t>(quantile * static_cast<double>(values.numel() - 1));
@@ -64,7 +39,7 @@ float quantile_within(const torch::Tensor& image, const torch::Tensor& mask, dou
 AnatomyOptions no_anatomy_variation() {
   AnatomyOptions options;
   options.scale_min = options.scale_max = 1.;
-  options.aspect = options.elastic_mm = options.contrast = 0.;
+  options.aspect = options.elastic_mm = options.contrast = options.rim_share = 0.;
   return options;
 }
 
@@ -80,6 +55,8 @@ AnatomySource::AnatomySource(const std::vector<BrainVolume>& volumes, const Netw
   require(options.elastic_spacing_mm >= 5. && options.elastic_spacing_mm <= 200., "elastic_spacing_mm",
           options.elastic_spacing_mm, "in 5 .. 200");
   require(options.contrast >= 0. && options.contrast <= 1., "contrast", options.contrast, "in 0 .. 1");
+  require(options.rim_share >= 0. && options.rim_share <= 1., "rim_share", options.rim_share, "in 0 .. 1");
+  require(options.rim_mm >= 0. && options.rim_mm <= 15., "rim_mm", options.rim_mm, "in 0 .. 15");
   if (volumes.empty()) throw std::invalid_argument("simulator: at least one brain volume is needed");
   if (!(grid.resolution_mm > 0.) || grid.volume_shape[0] < 2 || grid.volume_shape[1] < 2 || grid.volume_shape[2] < 2)
     throw std::invalid_argument("simulator: the grid must have at least 2 voxels along each axis, of a positive size");
@@ -116,9 +93,9 @@ AnatomySource::AnatomySource(const std::vector<BrainVolume>& volumes, const Netw
       const auto out = 2 * static_cast<std::int64_t>(std::ceil(reach / source.resolution_mm)) + 1;
       const std::int64_t in = volume.image.size(2 - axis);
       axes[static_cast<std::size_t>(2 - axis)] =
-          axis_filter(in, -0.5 * static_cast<double>(in - 1) * native, native, out,
-                      source.extent.centre[axis] - 0.5 * static_cast<double>(out - 1) * source.resolution_mm,
-                      source.resolution_mm, sigma)
+          low_pass_matrix(in, -0.5 * static_cast<double>(in - 1) * native, native, out,
+                          source.extent.centre[axis] - 0.5 * static_cast<double>(out - 1) * source.resolution_mm,
+                          source.resolution_mm, sigma)
               .to(device);
     }
     std::vector<torch::Tensor> filtered;
@@ -171,30 +148,21 @@ Anatomy AnatomySource::make(std::uint64_t seed, std::uint64_t number) const {
   // Smooth deformation on a lattice of control points; its rigid part is taken out, or it would be an unknown pose.
   torch::Tensor displacement;  // 3 x z x y x x, mm
   if (options_.elastic_mm > 0.) {
-    const double spacing = options_.elastic_spacing_mm;
     std::array<std::int64_t, 3> points{};
     std::array<torch::Tensor, 3> basis;
     for (std::size_t a = 0; a < 3; ++a) {
-      points[a] = 2 * static_cast<std::int64_t>(std::ceil(reach[static_cast<int>(a)] / spacing)) + 3;
-      basis[a] = torch::empty({count[a], points[a]}, torch::kFloat32);
-      auto values = basis[a].accessor<float, 2>();
-      const auto where = position[a].accessor<double, 1>();
-      for (std::int64_t i = 0; i < count[a]; ++i)
-        for (std::int64_t k = 0; k < points[a]; ++k)
-          values[i][k] = static_cast<float>(
-              b_spline(where[i] / spacing - (static_cast<double>(k) - 0.5 * static_cast<double>(points[a] - 1))));
+      points[a] = spline_points(reach[static_cast<int>(a)], options_.elastic_spacing_mm);
+      basis[a] = spline_matrix(position[a], points[a], options_.elastic_spacing_mm);
     }
     const std::int64_t total = points[0] * points[1] * points[2];
     Eigen::Matrix3Xd node(3, total), moved(3, total);
-    // Independent coefficients of deviation 1 make a spline of this deviation, on average over the lattice.
-    const double spline_deviation = std::pow(151. / 315., 1.5);
     std::int64_t i = 0;
     for (std::int64_t k = 0; k < points[2]; ++k)
       for (std::int64_t j = 0; j < points[1]; ++j)
         for (std::int64_t l = 0; l < points[0]; ++l, ++i) {
           node.col(i) << static_cast<double>(2 * l - points[0] + 1), static_cast<double>(2 * j - points[1] + 1),
               static_cast<double>(2 * k - points[2] + 1);
-          moved.col(i) = random.normal3(options_.elastic_mm / spline_deviation);
+          moved.col(i) = random.normal3(options_.elastic_mm / kSplineDeviation);
         }
     moved.colwise() -= moved.rowwise().mean().eval();
     Eigen::Matrix3d inertia = Eigen::Matrix3d::Zero();
@@ -245,11 +213,13 @@ Anatomy AnatomySource::make(std::uint64_t seed, std::uint64_t number) const {
   const torch::Tensor inside = sampled[0] > 0.5;
   part(anatomy.mask).copy_(inside);
   part(anatomy.image).copy_(sampled[1] * inside);
+  if (!inside.any().item<bool>())
+    throw std::invalid_argument("simulator: the brain does not reach into the grid; is the volume centred?");
+  RandomStream of_rim(seed, number, purpose::kRim);
+  if (of_rim.chance(options_.rim_share)) add_head_rim(options_.rim_mm, grid_.resolution_mm, &of_rim, &anatomy);
   BrainVolume measured;
   measured.mask = anatomy.mask;
   measured.resolution_mm = grid_.resolution_mm;
-  if (!inside.any().item<bool>())
-    throw std::invalid_argument("simulator: the brain does not reach into the grid; is the volume centred?");
   anatomy.extent = brain_extent(measured);
   return anatomy;
 }

@@ -4,6 +4,7 @@
 #include <stdexcept>
 
 #include "svort_ros/geometry/anchor_points.h"
+#include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/simulation/random_stream.h"
 #include "svort_ros/training/losses.h"
@@ -51,6 +52,13 @@ Batch batch_of(const std::vector<SimulatedScan>& scans) {
   return batch;
 }
 
+/// A scan's true poses, moved as one body to where most of its slices lie now: n x 3 x 4.
+torch::Tensor truth_as_placed(const torch::Tensor& truth, const torch::Tensor& placed, const AnchorFrame& frame) {
+  const Pose motion =
+      fit_most_planes(poses_from_tensor(truth), poses_from_tensor(placed), 0.5 * frame.width * frame.resolution);
+  return compose_transforms(tensor_from_pose(motion).to(truth.device()).expand_as(truth), truth);
+}
+
 StepLoss sum_of(const std::vector<std::tuple<const char*, double, torch::Tensor>>& terms) {
   StepLoss loss;
   for (const auto& [name, weight, value] : terms) {
@@ -92,6 +100,7 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
   require(share(options.second_update_share), "second_update_share", "0 to 1");
   require(share(options.pulls_unknown_share), "pulls_unknown_share", "0 to 1");
   require(options.beta > 0. && std::isfinite(options.beta), "beta", "positive");
+  require(options.shared_beta > 0. && std::isfinite(options.shared_beta), "shared_beta", "positive");
   require(size(options.mirror_weight), "mirror_weight", "zero or positive");
   require(size(options.scale_weight), "scale_weight", "zero or positive");
   require(size(options.quality_weight), "quality_weight", "zero or positive");
@@ -187,11 +196,19 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   const AnchorFrame frame = live_anchor_frame(shape);
   const torch::Tensor rest =
       anchor_points_from_matrix(torch::eye(4, truth.options()).slice(0, 0, 3).unsqueeze(0), frame);
+  // Where the whole lies is for find_frame() to say: the update puts slices where they belong among the others.
+  std::vector<torch::Tensor> wanted;
+  std::int64_t begin = 0;
+  for (const std::int64_t n : lengths) {
+    wanted.push_back(truth_as_placed(truth.narrow(0, begin, n), input.transforms.narrow(0, begin, n), frame));
+    begin += n;
+  }
   const torch::Tensor target =
-      (anchor_points_from_matrix(compose_transforms(inverse_transform(input.transforms), truth), frame) - rest) /
+      (anchor_points_from_matrix(compose_transforms(inverse_transform(input.transforms), torch::cat(wanted)), frame) -
+       rest) /
       kLiveUpdateUnitMm;
   const LiveOutput said = update();
-  const torch::Tensor points = smooth_l1_loss(said.points, target, options_.beta);
+  const torch::Tensor points = smooth_l1_loss(said.points, target, options_.shared_beta);
   const torch::Tensor error = (said.points - target).detach().view({-1, 3, 3}).norm(2, 2).mean(1);
   StepLoss loss =
       sum_of({{"shared_points", 1., points},
@@ -199,7 +216,8 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
               {"shared_quality", options_.quality_weight,
                torch::binary_cross_entropy_with_logits(said.quality, good, {}, {}, torch::Reduction::None)}});
   // What doing nothing would cost: the shared network has learnt something once it is below.
-  loss.parts["shared_start"] = smooth_l1_loss(torch::zeros_like(target), target, options_.beta).mean().item<double>();
+  loss.parts["shared_start"] =
+      smooth_l1_loss(torch::zeros_like(target), target, options_.shared_beta).mean().item<double>();
   return loss;
 }
 

@@ -104,6 +104,11 @@ TEST(RigidTransformPoses, TensorAndPose) {
   EXPECT_TRUE(pose_from_tensor(tensor).isApprox(pose, 1e-6));
   const Pose restored = pose_from_tensor(tensor[0]);
   EXPECT_TRUE(is_rigid(restored, 1e-14));  // re-orthonormalised in float64
+  const torch::Tensor many = tensor_from_poses({Pose::Identity(), pose});
+  EXPECT_EQ(many.sizes(), torch::IntArrayRef({2, 3, 4}));
+  EXPECT_TRUE(torch::equal(many[1], tensor[0]));
+  EXPECT_TRUE(poses_from_tensor(many).at(1).isApprox(pose, 1e-6));
+  EXPECT_TRUE(poses_from_tensor(tensor_from_poses({})).empty());
   const torch::Tensor point = torch::tensor({{1.F, 2.F, 3.F}});
   const Eigen::Vector3d expected = pose * Eigen::Vector3d(1., 2., 3.);
   const torch::Tensor moved = transform_points(tensor, point);
@@ -121,6 +126,7 @@ TEST(RigidTransformErrors, NameTheArgument) {
   EXPECT_THROW(anchor_points_from_matrix(torch::zeros({2, 3, 4}), AnchorFrame{1, 128, 1.}), std::invalid_argument);
   EXPECT_THROW(pose_from_tensor(torch::zeros({2, 3, 4})), std::invalid_argument);
   EXPECT_THROW(pose_from_tensor(torch::zeros({3, 4})), std::invalid_argument);
+  EXPECT_THROW(poses_from_tensor(torch::zeros({3, 4})), std::invalid_argument);
   EXPECT_THROW(pose_from_tensor(torch::full({3, 4}, NAN)), std::invalid_argument);
 }
 

@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 #include <torch/types.h>
 
+#include <algorithm>
 #include <cmath>
 #include <set>
 
@@ -202,6 +203,70 @@ TEST(ScanSimulator, PreparedSlicesAreCroppedAsTheLiveSequenceDoes) {
   EXPECT_TRUE(some_cut);
 }
 
+TEST(AnatomySource, ARimLiesAroundTheBrainAndLeavesItAsItIs) {
+  AnatomyOptions options;
+  const AnatomySource bare(phantoms(), coarse_grid(), options, torch::kCPU);
+  options.rim_share = 1.;
+  options.rim_mm = 10.;
+  const AnatomySource rimmed(phantoms(), coarse_grid(), options, torch::kCPU);
+  // Within 15 voxels (30 mm) of the brain; the field makes the rim at most about three times its mean of up to 10 mm.
+  const auto grown = [](const torch::Tensor& mask, std::int64_t voxels) {
+    return torch::max_pool3d(mask.to(torch::kFloat32).view({1, 1, 56, 60, 64}), 2 * voxels + 1, 1, voxels)
+               .view({56, 60, 64}) > 0.;
+  };
+  double most = 0.;
+  bool dark = false, bright = false;
+  for (std::uint64_t number = 0; number < 6; ++number) {
+    const Anatomy before = bare.make(3, number), after = rimmed.make(3, number), again = rimmed.make(3, number);
+    EXPECT_TRUE(torch::equal(after.image, again.image));
+    const torch::Tensor rim = after.mask & ~before.mask;
+    EXPECT_FALSE((before.mask & ~after.mask).any().item<bool>());
+    EXPECT_TRUE(torch::equal(after.image.masked_fill(rim, 0.), before.image));
+    EXPECT_TRUE((after.image.masked_select(rim) > 0.).all().item<bool>());
+    EXPECT_FALSE((rim & ~grown(before.mask, 15)).any().item<bool>());
+    const double share = rim.sum().item<double>() / before.mask.sum().item<double>();
+    most = std::max(most, share);
+    if (share > 0.1) {
+      dark = dark || (after.image.masked_select(rim) < 0.4).any().item<bool>();
+      bright = bright || (after.image.masked_select(rim) > 0.4).any().item<bool>();
+    }
+    BrainVolume measured;
+    measured.mask = after.mask;
+    measured.resolution_mm = coarse_grid().resolution_mm;
+    EXPECT_EQ(after.extent.half_size, brain_extent(measured).half_size);
+  }
+  EXPECT_GT(most, 0.3);
+  EXPECT_TRUE(dark);
+  EXPECT_TRUE(bright);
+}
+
+TEST(AnatomySource, ARimIsAsThickAsItsMeanSays) {
+  // A ball, so that the rim's volume says its thickness.
+  BrainVolume ball;
+  ball.name = "ball";
+  const torch::Tensor axis = torch::arange(64, torch::kFloat32) - 31.5;
+  const torch::Tensor radius2 = axis.square().view({64, 1, 1}) + axis.square().view({64, 1}) + axis.square();
+  constexpr double kRadius = 18.;  // voxels of 2 mm
+  ball.mask = radius2 < kRadius * kRadius;
+  ball.image = ball.mask.to(torch::kFloat32);
+  ball.resolution_mm = 2.;
+  NetworkGrid grid;
+  grid.volume_shape = {64, 64, 64};
+  grid.resolution_mm = 2.;
+  AnatomyOptions options = no_anatomy_variation();
+  options.rim_share = 1.;
+  const AnatomySource source({ball}, grid, options, torch::kCPU);
+  const double brain = ball.mask.sum().item<double>();
+  double sum = 0.;
+  constexpr int kBrains = 60;
+  for (std::uint64_t number = 0; number < kBrains; ++number) {
+    const double volume = source.make(5, number).mask.sum().item<double>();
+    sum += 2. * kRadius * (std::cbrt(volume / brain) - 1.);
+  }
+  // Means are uniform in 0 .. 8 mm: 4 mm on average, give or take 0.3 mm over 60 brains.
+  EXPECT_NEAR(sum / kBrains, 4., 1.);
+}
+
 TEST(ScanSimulator, RefusesWhatDoesNotFit) {
   const auto message = [](const SimulatorOptions& options, const std::vector<BrainVolume>& volumes) {
     try {
@@ -221,6 +286,12 @@ TEST(ScanSimulator, RefusesWhatDoesNotFit) {
   options = {};
   options.artifacts.drop_share = 1.5;
   EXPECT_NE(message(options, phantoms()).find("drop_share"), std::string::npos);
+  options = {};
+  options.anatomy.rim_mm = 20.;
+  EXPECT_NE(message(options, phantoms()).find("rim_mm"), std::string::npos);
+  options = {};
+  options.anatomy.rim_share = -0.1;
+  EXPECT_NE(message(options, phantoms()).find("rim_share"), std::string::npos);
   auto volumes = phantoms();
   volumes[0].mask.zero_();
   EXPECT_NE(message({}, volumes).find("no brain voxel"), std::string::npos);

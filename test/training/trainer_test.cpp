@@ -291,6 +291,11 @@ TEST_F(TrainerTest, WarmStartsAreTheTruthIfNothingPerturbsThem) {
   LiveRecipe still(std::make_shared<LiveNetwork>(small_network()), options, 1);
   const auto scans = simulator()->simulate(0, 1);
   EXPECT_LT(still.loss(scans, 0).parts.at("shared_start"), 1e-6);
+  // Where the whole lies is not the shared network's to say.
+  options.global_deg = 20.;
+  options.global_mm = 10.;
+  LiveRecipe elsewhere(std::make_shared<LiveNetwork>(small_network()), options, 1);
+  EXPECT_LT(elsewhere.loss(scans, 0).parts.at("shared_start"), 1e-6);
   options.perturb_mm = 6.;
   LiveRecipe moving(std::make_shared<LiveNetwork>(small_network()), options, 1);
   EXPECT_GT(moving.loss(scans, 0).parts.at("shared_start"), 1e-3);

@@ -2,6 +2,8 @@
 
 #include <torch/types.h>
 
+#include <vector>
+
 #include "svort_ros/geometry/pose.h"
 
 namespace svort {
@@ -38,5 +40,9 @@ torch::Tensor tensor_from_pose(const Pose& pose);
 
 /// Inverse of tensor_from_pose; the argument is 3 x 4 or 1 x 3 x 4. The rotation is re-orthonormalised.
 Pose pose_from_tensor(const torch::Tensor& matrix);
+
+/// The same for many: n x 3 x 4, on the CPU; and back.
+torch::Tensor tensor_from_poses(const std::vector<Pose>& poses);
+std::vector<Pose> poses_from_tensor(const torch::Tensor& matrices);
 
 }  // namespace svort

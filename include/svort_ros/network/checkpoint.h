@@ -2,8 +2,10 @@
 
 #include <torch/types.h>
 
+#include <cstdint>
 #include <filesystem>
 #include <map>
+#include <optional>
 #include <string>
 
 #include "svort_ros/network/network_registry.h"
@@ -58,5 +60,13 @@ NetworkInstance load_network(const std::filesystem::path& file, Checkpoint* chec
 
 /// True if the checkpoint says that its weights have learnt nothing: provenance "untrained" is there.
 bool is_untrained(const Provenance& provenance);
+
+constexpr const char* kProvenanceScans = "scans";               ///< seen in training, all in all
+constexpr const char* kProvenanceScansBefore = "scans before";  ///< seen by the weights that training started from
+
+/// Scans that weights have seen in training, as the provenance says under `key`; nothing if it does not say.
+/// @throws std::runtime_error naming the file if what it says is no number
+std::optional<std::int64_t> scans_seen(const Provenance& provenance, const std::filesystem::path& file,
+                                       const char* key = kProvenanceScans);
 
 }  // namespace svort

@@ -18,6 +18,8 @@ struct AnatomyOptions {
   double elastic_mm = 2.5;          ///< root mean square displacement of the smooth deformation, per axis
   double elastic_spacing_mm = 30.;  ///< distance of the deformation's control points
   double contrast = 0.12;           ///< standard deviation of each tissue's own factor; needs labels
+  double rim_share = 0.;            ///< share of brains whose mask reaches into the skull and the scalp
+  double rim_mm = 8.;               ///< such a rim's largest mean thickness
 
   template <class Visitor>
   void visit(Visitor&& v) {
@@ -27,6 +29,8 @@ struct AnatomyOptions {
     v("elastic_mm", elastic_mm, "root mean square displacement of the smooth deformation, per axis, mm");
     v("elastic_spacing_mm", elastic_spacing_mm, "distance of the deformation's control points, mm");
     v("contrast", contrast, "standard deviation of each tissue's own factor (volumes with labels)");
+    v("rim_share", rim_share, "share of brains whose mask reaches into the skull and the scalp");
+    v("rim_mm", rim_mm, "such a rim's largest mean thickness, mm");
   }
 };
 
@@ -35,9 +39,9 @@ AnatomyOptions no_anatomy_variation();
 
 /// One brain on the simulator's grid.
 struct Anatomy {
-  torch::Tensor image;  ///< D x H x W, float32, 0 off the brain, 1 at the 0.99 quantile of the given volume's brain
-  torch::Tensor mask;   ///< D x H x W, bool
-  BrainExtent extent;
+  torch::Tensor image;  ///< D x H x W, float32, 0 off the mask, 1 at the 0.99 quantile of the given volume's brain
+  torch::Tensor mask;   ///< D x H x W, bool: the brain, and its rim if it has one
+  BrainExtent extent;   ///< of the mask
 };
 
 /// Makes anatomies from given brains, on one device.

@@ -39,7 +39,8 @@ class TrainingRecipe {
 /// How the live network is trained.
 struct LiveRecipeOptions {
   double first_share = 0.8;          ///< share of steps that train the first network; the others the shared one
-  double beta = 0.5;                 ///< where smooth L1 becomes linear, in the outputs' own units (50 and 10 mm)
+  double beta = 0.5;                 ///< where smooth L1 of the first network becomes linear, in its unit (50 mm)
+  double shared_beta = 0.1;          ///< the same of the shared network, in its unit (10 mm)
   double mirror_weight = 1.;         ///< of the mirror head's loss
   double scale_weight = 0.05;        ///< of the loss of the expected error
   double quality_weight = 0.05;      ///< of the loss of the slice's weight
@@ -54,7 +55,8 @@ struct LiveRecipeOptions {
   template <class Visitor>
   void visit(Visitor&& v) {
     v("first_share", first_share, "share of steps that train the first network; the others train the shared one");
-    v("beta", beta, "where smooth L1 becomes linear, in the outputs' units (50 mm first, 10 mm shared network)");
+    v("beta", beta, "where smooth L1 of the first network becomes linear, in its unit (50 mm)");
+    v("shared_beta", shared_beta, "the same of the shared network, in its unit (10 mm)");
     v("mirror_weight", mirror_weight, "weight of the mirror head's loss");
     v("scale_weight", scale_weight, "weight of the loss of the expected error");
     v("quality_weight", quality_weight, "weight of the loss of the slices' quality");
@@ -73,7 +75,9 @@ struct LiveRecipeOptions {
 ///
 /// A step trains either the first network, or one random iteration of the shared network: from where the first network
 /// places the slices, as it is now, or from the truth, perturbed, after no or one update without gradient. The volume
-/// is the PSF reconstruction at those places, without gradient.
+/// is the PSF reconstruction at those places, without gradient. The update is to put slices where they belong among the
+/// others: its target is the truth, moved as one body to where most slices lie, because LiveNetwork::find_frame() says
+/// afterwards where the whole lies.
 class LiveRecipe : public TrainingRecipe {
  public:
   /// @throws std::invalid_argument naming the option that is out of range

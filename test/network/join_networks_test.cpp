@@ -1,0 +1,84 @@
+#include "svort_ros/network/join_networks.h"
+
+#include <gtest/gtest.h>
+
+#include <cstdlib>
+#include <functional>
+
+#include "network/small_networks.h"
+
+namespace svort {
+namespace {
+
+class JoinNetworksTest : public ::testing::Test {
+ protected:
+  void SetUp() override {
+    std::string pattern = (std::filesystem::temp_directory_path() / "join_networks_test_XXXXXX").string();
+    ASSERT_NE(mkdtemp(pattern.data()), nullptr);
+    folder_ = pattern;
+  }
+  void TearDown() override { std::filesystem::remove_all(folder_); }
+
+  std::filesystem::path write(const std::string& name, std::uint64_t seed, const Provenance& provenance,
+                              std::int64_t dim = 24, const std::string& network = "live") const {
+    torch::manual_seed(seed);
+    const OptionValues live = {
+        {"input_px", std::int64_t{16}}, {"width", std::int64_t{8}},  {"dim", dim},
+        {"heads", std::int64_t{2}},     {"layers", std::int64_t{1}}, {"hidden", std::int64_t{16}}};
+    const NetworkInstance instance = make_network(network, network == "live" ? live : small_svort_options());
+    for (torch::Tensor& parameter : instance.module->parameters()) parameter.data().normal_();
+    save_network(folder_ / name, instance, provenance);
+    return folder_ / name;
+  }
+  static std::string message(const std::function<void()>& action) {
+    try {
+      action();
+    } catch (const std::runtime_error& error) {
+      return error.what();
+    }
+    return "";
+  }
+
+  std::filesystem::path folder_;
+};
+
+TEST_F(JoinNetworksTest, EachPartComesFromItsFile) {
+  const auto first = write("first.pt", 1, {{"scans", "140"}, {"scans before", "100"}, {"seed", "7"}, {"note", "mine"}});
+  const auto shared = write("shared.pt", 2, {{"scans", "125"}, {"scans before", "100"}, {"seed", "8"}});
+  const JoinedNetwork joined = join_live_networks(first, shared);
+  const Checkpoint a = read_checkpoint(first), b = read_checkpoint(shared);
+  int of_first = 0, of_shared = 0;
+  for (const auto& entry : joined.network.module->named_parameters()) {
+    const bool is_shared = entry.key().rfind("shared_", 0) == 0;
+    (is_shared ? of_shared : of_first) += 1;
+    EXPECT_TRUE(torch::equal(entry.value(), (is_shared ? b : a).parameters.at(entry.key()))) << entry.key();
+    EXPECT_FALSE(torch::equal(entry.value(), (is_shared ? a : b).parameters.at(entry.key()))) << entry.key();
+  }
+  EXPECT_GT(of_first, 10);
+  EXPECT_GT(of_shared, 10);
+  // 100 before, 40 of the first network, 25 of the shared one.
+  EXPECT_EQ(joined.provenance.at("scans"), "165");
+  EXPECT_EQ(joined.provenance.at("note"), "mine");
+  EXPECT_EQ(joined.provenance.at("first network"), "weights " + a.sha256 + ", after 140 scans, seed 7");
+  EXPECT_EQ(joined.provenance.at("shared network"), "weights " + b.sha256 + ", after 125 scans, seed 8");
+}
+
+TEST_F(JoinNetworksTest, RefusesWhatDoesNotFit) {
+  const auto first = write("first.pt", 1, {{"scans", "140"}});
+  EXPECT_NE(message([&] {
+              join_live_networks(first, write("wide.pt", 2, {}, 32));
+            }).find("wide.pt: option 'dim' is 32, but 24 in "),
+            std::string::npos);
+  EXPECT_NE(message([&] {
+              join_live_networks(first, write("v2.pt", 2, {}, 24, "v2"));
+            }).find("v2.pt: holds the network 'v2'"),
+            std::string::npos);
+  EXPECT_NE(message([&] {
+              join_live_networks(first, write("odd.pt", 2, {{"scans", "many"}}));
+            }).find("odd.pt: its provenance gives 'many' under 'scans', which is no number of scans"),
+            std::string::npos);
+  EXPECT_NE(message([&] { join_live_networks(folder_ / "none.pt", first); }).find("none.pt"), std::string::npos);
+}
+
+}  // namespace
+}  // namespace svort
