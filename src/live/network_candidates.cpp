@@ -2,7 +2,6 @@
 
 #include <torch/types.h>
 
-#include <algorithm>
 #include <optional>
 #include <stdexcept>
 #include <utility>
@@ -10,6 +9,7 @@
 #include "estimator_network.h"
 #include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/live/network_input.h"
+#include "svort_ros/live/sequence_tensors.h"
 
 namespace svort {
 namespace {
@@ -55,9 +55,7 @@ std::unique_ptr<IncrementalLiveNetwork> NetworkCandidates::fresh() const {
 std::vector<PoseCandidate> NetworkCandidates::propose(const SliceSequence& sequence, std::size_t position,
                                                       IncrementalRefinement& engine) {
   const PreparedSlice& slice = *sequence.slices().at(position);
-  torch::Tensor pixels = torch::empty({slice.size, slice.size}, torch::kFloat32);
-  std::copy(slice.pixels.begin(), slice.pixels.end(), pixels.data_ptr<float>());
-  network_->insert(position, pixels, slice.resolution, slice.info.thickness);
+  network_->insert(position, pixel_tensor(slice)[0][0], slice.resolution, slice.info.thickness);
 
   const torch::Tensor volume = engine.volume();
   if (!volume.defined()) return {};

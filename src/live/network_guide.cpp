@@ -1,12 +1,12 @@
 #include "svort_ros/live/network_guide.h"
 
-#include <algorithm>
 #include <stdexcept>
 #include <utility>
 
 #include "estimator_network.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/live/network_input.h"
+#include "svort_ros/live/sequence_tensors.h"
 
 namespace svort {
 namespace {
@@ -39,9 +39,7 @@ torch::Tensor NetworkGuide::features(const SliceSequence& sequence) {
   for (const auto& slice : sequence.slices()) {
     auto found = encoded_.find(slice);
     if (found == encoded_.end()) {
-      torch::Tensor pixels = torch::empty({1, 1, slice->size, slice->size}, torch::kFloat32);
-      std::copy(slice->pixels.begin(), slice->pixels.end(), pixels.data_ptr<float>());
-      found = encoded_.emplace(slice, network_->encode(pixels, slice->resolution)).first;
+      found = encoded_.emplace(slice, network_->encode(pixel_tensor(*slice), slice->resolution)).first;
       ++count_;
     }
     rows.push_back(found->second);

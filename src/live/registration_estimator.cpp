@@ -126,9 +126,8 @@ void RegistrationEstimator::add_incrementally(const SliceSequence& sequence, std
   const PreparedSlice& newest = *sequence.slices()[position];
   std::vector<SliceEstimate>& slices = estimate_.slices;
   IncrementalSlice slice;
-  slice.pixels = torch::empty({prepared.size_px, prepared.size_px}, torch::kFloat32);
+  slice.pixels = pixel_tensor(newest)[0][0];
   slice.mask = torch::empty({prepared.size_px, prepared.size_px}, torch::kBool);
-  std::copy(newest.pixels.begin(), newest.pixels.end(), slice.pixels.data_ptr<float>());
   std::transform(newest.mask.begin(), newest.mask.end(), slice.mask.data_ptr<bool>(),
                  [](std::uint8_t value) { return value != 0; });
   slice.T_world_slice = newest.info.T_scanner_slice * newest.T_slice_crop;

@@ -7,6 +7,12 @@
 
 namespace svort {
 
+torch::Tensor pixel_tensor(const PreparedSlice& slice) {
+  torch::Tensor pixels = torch::empty({1, 1, slice.size, slice.size}, torch::kFloat32);
+  std::copy(slice.pixels.begin(), slice.pixels.end(), pixels.data_ptr<float>());
+  return pixels;
+}
+
 SequenceTensors sequence_tensors(const SliceSequence& sequence) {
   const auto& slices = sequence.slices();
   if (slices.empty()) throw std::invalid_argument("sequence_tensors: the sequence holds no slice");

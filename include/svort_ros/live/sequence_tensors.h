@@ -7,6 +7,9 @@
 
 namespace svort {
 
+/// Pixels of one prepared slice as they were prepared, not divided by the scale: 1 x 1 x h x w, float32.
+torch::Tensor pixel_tensor(const PreparedSlice& slice);
+
 /// The prepared slices of a sequence, in its order.
 struct SequenceTensors {
   torch::Tensor pixels;  ///< n x 1 x h x w, float32, intensity divided by the sequence's scale, 0 off the brain
