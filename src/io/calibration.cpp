@@ -50,17 +50,18 @@ using SliceKey = std::pair<int, int>;
 /// Distance of each slice from its true place, mm, after the one rigid transform that fits best.
 std::map<SliceKey, double> pose_errors_of(const std::vector<PoseRow>& poses, const std::map<SliceKey, PoseRow>& truth,
                                           const fs::path& truth_path) {
-  std::vector<torch::Tensor> estimated, known;
+  std::vector<Pose> estimated, known;
   for (const PoseRow& row : poses) {
     const auto found = truth.find({row.stack, row.slice});
     if (found == truth.end())
       throw std::runtime_error(truth_path.string() + ": slice " + std::to_string(row.slice) + " of stack " +
                                std::to_string(row.stack) + " is not there");
-    estimated.push_back(tensor_from_pose(row.T_brain_slice));
-    known.push_back(tensor_from_pose(found->second.T_brain_slice));
+    estimated.push_back(row.T_brain_slice);
+    known.push_back(found->second.T_brain_slice);
   }
   if (estimated.empty()) return {};
-  const torch::Tensor errors = relative_pose_errors(torch::cat(estimated), torch::cat(known), AnchorFrame()).ed;
+  const torch::Tensor errors =
+      relative_pose_errors(tensor_from_poses(estimated), tensor_from_poses(known), AnchorFrame()).ed;
   std::map<SliceKey, double> result;
   for (std::size_t i = 0; i < poses.size(); ++i)
     result[{poses[i].stack, poses[i].slice}] = errors[static_cast<std::int64_t>(i)].item<double>();

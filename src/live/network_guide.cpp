@@ -69,10 +69,9 @@ NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, cons
   }
   Pose T_centred_brain = Pose::Identity();
   T_centred_brain.translation() = -0.5 * (low + high);
-  for (std::size_t i = 0; i < T_brain_crop.size(); ++i) {
-    input.transforms[static_cast<std::int64_t>(i)].copy_(
-        tensor_from_pose(T_centred_brain * T_brain_crop[i]).squeeze(0));
-  }
+  std::vector<Pose> T_centred_crop;
+  for (const Pose& pose : T_brain_crop) T_centred_crop.push_back(T_centred_brain * pose);
+  input.transforms = tensor_from_poses(T_centred_crop);
   const LiveFrame frame = network_->find_frame(features(sequence), input);
   return {pose_from_tensor(frame.motion) * T_centred_brain, frame.agreement};
 }

@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "io/scratch.h"
 #include "moving_scan.h"
 #include "network/small_networks.h"
 #include "svort_ros/geometry/rigid_fit.h"
@@ -149,12 +150,9 @@ TEST(CandidateSource, NeedsTheIncrementalUpdate) {
 }
 
 /// The live network with weights that are as good as random, from a file.
-class LiveNetworkCandidates : public ::testing::Test {
+class LiveNetworkCandidates : public Scratch {
  protected:
   void SetUp() override {
-    std::string pattern = (std::filesystem::temp_directory_path() / "network_candidates_test_XXXXXX").string();
-    ASSERT_NE(mkdtemp(pattern.data()), nullptr);
-    folder_ = pattern;
     save("live", {{"input_px", std::int64_t{48}},
                   {"width", std::int64_t{8}},
                   {"dim", std::int64_t{24}},
@@ -163,13 +161,12 @@ class LiveNetworkCandidates : public ::testing::Test {
                   {"hidden", std::int64_t{32}}});
     options_ = quick_options();
     options_.estimator.network.candidate = true;
-    options_.estimator.network.weights = (folder_ / "live.pt").string();
+    options_.estimator.network.weights = path("live.pt").string();
   }
-  void TearDown() override { std::filesystem::remove_all(folder_); }
   void save(const std::string& name, const OptionValues& values) const {
     const NetworkInstance network = make_network(name, values);
     fill_deterministically(*network.module);
-    save_network(folder_ / (name + ".pt"), network, {{"untrained", "for a test"}});
+    save_network(path(name + ".pt"), network, {{"untrained", "for a test"}});
   }
   std::string error() const {
     try {
@@ -180,7 +177,6 @@ class LiveNetworkCandidates : public ::testing::Test {
     return "";
   }
 
-  std::filesystem::path folder_;
   PipelineOptions options_;
 };
 
@@ -238,7 +234,7 @@ TEST_F(LiveNetworkCandidates, NamesTheOptionThatIsWrong) {
   EXPECT_NE(error().find("estimator.network.weights is empty; estimator.network.candidate"), std::string::npos)
       << error();
   save("v2", small_svort_options());
-  network.weights = (folder_ / "v2.pt").string();
+  network.weights = path("v2.pt").string();
   EXPECT_NE(error().find("the network is 'v2'"), std::string::npos) << error();
 }
 

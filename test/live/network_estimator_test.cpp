@@ -9,6 +9,7 @@
 #include <string>
 #include <vector>
 
+#include "io/scratch.h"
 #include "network/small_networks.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/live/live_pipeline.h"
@@ -211,19 +212,15 @@ TEST(NetworkInput, AnEmptySequenceIsAnError) {
 }
 
 /// From a file of weights to poses, through the pipeline.
-class NetworkMethod : public ::testing::Test {
+class NetworkMethod : public Scratch {
  protected:
   void SetUp() override {
-    std::string pattern = (std::filesystem::temp_directory_path() / "network_estimator_test_XXXXXX").string();
-    ASSERT_NE(mkdtemp(pattern.data()), nullptr);
-    folder_ = pattern;
     const NetworkInstance network = make_network("v2", small_svort_options());
     fill_deterministically(*network.module);
-    save_network(folder_ / "v2.pt", network, {{"untrained", "for a test"}});
+    save_network(path("v2.pt"), network, {{"untrained", "for a test"}});
     options_.estimator = small_options();
-    options_.estimator.network.weights = (folder_ / "v2.pt").string();
+    options_.estimator.network.weights = path("v2.pt").string();
   }
-  void TearDown() override { std::filesystem::remove_all(folder_); }
   std::string error() const {
     try {
       const LivePipeline pipeline(options_);
@@ -233,7 +230,6 @@ class NetworkMethod : public ::testing::Test {
     return "";
   }
 
-  std::filesystem::path folder_;
   PipelineOptions options_;
 };
 
@@ -276,7 +272,7 @@ TEST_F(NetworkMethod, NamesTheOptionThatIsWrong) {
   options_.estimator.network.formulation = "rough";
   EXPECT_NE(error().find("estimator.network.formulation: "), std::string::npos) << error();
   options_.estimator.network.formulation = "exact";
-  options_.estimator.network.weights = (folder_ / "none.pt").string();
+  options_.estimator.network.weights = path("none.pt").string();
   EXPECT_NE(error().find("none.pt: cannot be read"), std::string::npos) << error();
   options_.estimator.network.weights.clear();
   EXPECT_NE(error().find("estimator.network.weights is empty"), std::string::npos) << error();

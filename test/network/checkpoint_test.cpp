@@ -3,30 +3,26 @@
 #include <gtest/gtest.h>
 #include <torch/serialize.h>
 
-#include <cstdlib>
 #include <fstream>
 #include <functional>
 #include <iterator>
 #include <limits>
 #include <vector>
 
+#include "io/scratch.h"
 #include "network/small_networks.h"
 #include "svort_ros/network/deterministic_weights.h"
 
 namespace svort {
 namespace {
 
-class CheckpointTest : public ::testing::Test {
+class CheckpointTest : public Scratch {
  protected:
   void SetUp() override {
-    std::string pattern = (std::filesystem::temp_directory_path() / "checkpoint_test_XXXXXX").string();
-    ASSERT_NE(mkdtemp(pattern.data()), nullptr);
-    folder_ = pattern;
-    file_ = folder_ / "weights.pt";
+    file_ = path("weights.pt");
     torch::manual_seed(3);
     network_ = make_network("v2", small_svort_options());
   }
-  void TearDown() override { std::filesystem::remove_all(folder_); }
 
   /// Writes network_'s file with something changed in its dictionary.
   void write_changed(const std::function<void(c10::impl::GenericDict&)>& change) {
@@ -68,7 +64,7 @@ class CheckpointTest : public ::testing::Test {
     EXPECT_NE(message.find(file_.string()), std::string::npos) << "the file is not named: " << message;
   }
 
-  std::filesystem::path folder_, file_;
+  std::filesystem::path file_;
   NetworkInstance network_;
 };
 
@@ -169,7 +165,7 @@ TEST_F(CheckpointTest, OneChangedWeightIsNoticed) {
 }
 
 TEST_F(CheckpointTest, SavingWithoutAFolderIsAnError) {
-  EXPECT_THROW(save_network(folder_ / "none" / "weights.pt", network_, {}), std::runtime_error);
+  EXPECT_THROW(save_network(path("none") / "weights.pt", network_, {}), std::runtime_error);
 }
 
 TEST(NetworkRegistry, NamesTheNetworkAndTheOption) {

@@ -2,49 +2,30 @@
 
 #include <gtest/gtest.h>
 
-#include <cstdlib>
-#include <functional>
-
+#include "io/scratch.h"
 #include "network/small_networks.h"
 
 namespace svort {
 namespace {
 
-class JoinNetworksTest : public ::testing::Test {
+class JoinNetworksTest : public Scratch {
  protected:
-  void SetUp() override {
-    std::string pattern = (std::filesystem::temp_directory_path() / "join_networks_test_XXXXXX").string();
-    ASSERT_NE(mkdtemp(pattern.data()), nullptr);
-    folder_ = pattern;
-  }
-  void TearDown() override { std::filesystem::remove_all(folder_); }
-
-  std::filesystem::path write(const std::string& name, std::uint64_t seed, const Provenance& provenance,
-                              std::int64_t dim = 24, const std::string& network = "live") const {
+  std::filesystem::path save(const std::string& name, std::uint64_t seed, const Provenance& provenance,
+                             std::int64_t dim = 24, const std::string& network = "live") const {
     torch::manual_seed(seed);
     const OptionValues live = {
         {"input_px", std::int64_t{16}}, {"width", std::int64_t{8}},  {"dim", dim},
         {"heads", std::int64_t{2}},     {"layers", std::int64_t{1}}, {"hidden", std::int64_t{16}}};
     const NetworkInstance instance = make_network(network, network == "live" ? live : small_svort_options());
     for (torch::Tensor& parameter : instance.module->parameters()) parameter.data().normal_();
-    save_network(folder_ / name, instance, provenance);
-    return folder_ / name;
+    save_network(path(name), instance, provenance);
+    return path(name);
   }
-  static std::string message(const std::function<void()>& action) {
-    try {
-      action();
-    } catch (const std::runtime_error& error) {
-      return error.what();
-    }
-    return "";
-  }
-
-  std::filesystem::path folder_;
 };
 
 TEST_F(JoinNetworksTest, EachPartComesFromItsFile) {
-  const auto first = write("first.pt", 1, {{"scans", "140"}, {"scans before", "100"}, {"seed", "7"}, {"note", "mine"}});
-  const auto shared = write("shared.pt", 2, {{"scans", "125"}, {"scans before", "100"}, {"seed", "8"}});
+  const auto first = save("first.pt", 1, {{"scans", "140"}, {"scans before", "100"}, {"seed", "7"}, {"note", "mine"}});
+  const auto shared = save("shared.pt", 2, {{"scans", "125"}, {"scans before", "100"}, {"seed", "8"}});
   const JoinedNetwork joined = join_live_networks(first, shared);
   const Checkpoint a = read_checkpoint(first), b = read_checkpoint(shared);
   int of_first = 0, of_shared = 0;
@@ -64,20 +45,16 @@ TEST_F(JoinNetworksTest, EachPartComesFromItsFile) {
 }
 
 TEST_F(JoinNetworksTest, RefusesWhatDoesNotFit) {
-  const auto first = write("first.pt", 1, {{"scans", "140"}});
-  EXPECT_NE(message([&] {
-              join_live_networks(first, write("wide.pt", 2, {}, 32));
-            }).find("wide.pt: option 'dim' is 32, but 24 in "),
-            std::string::npos);
-  EXPECT_NE(message([&] {
-              join_live_networks(first, write("v2.pt", 2, {}, 24, "v2"));
-            }).find("v2.pt: holds the network 'v2'"),
-            std::string::npos);
-  EXPECT_NE(message([&] {
-              join_live_networks(first, write("odd.pt", 2, {{"scans", "many"}}));
-            }).find("odd.pt: its provenance gives 'many' under 'scans', which is no number of scans"),
-            std::string::npos);
-  EXPECT_NE(message([&] { join_live_networks(folder_ / "none.pt", first); }).find("none.pt"), std::string::npos);
+  const auto first = save("first.pt", 1, {{"scans", "140"}});
+  const auto wide = save("wide.pt", 2, {}, 32), v2 = save("v2.pt", 2, {}, 24, "v2"),
+             odd = save("odd.pt", 2, {{"scans", "many"}});
+  EXPECT_MESSAGE(join_live_networks(first, wide), "wide.pt: option 'dim' is 32, but 24 in ");
+  EXPECT_MESSAGE(join_live_networks(first, v2), "v2.pt: holds the network 'v2'");
+  EXPECT_MESSAGE(join_live_networks(first, odd),
+                 "odd.pt: its provenance gives 'many' under 'scans', which is no number of scans");
+  EXPECT_MESSAGE(join_live_networks(path("none.pt"), first), "none.pt");
+  for (const auto& file : {wide, v2, odd, path("none.pt")})
+    EXPECT_THROW(join_live_networks(first, file), std::runtime_error) << file;
 }
 
 }  // namespace
