@@ -34,6 +34,70 @@ float quantile_within(const torch::Tensor& image, const torch::Tensor& mask, dou
   return values[rank].item<float>();
 }
 
+/// Takes out of a deformation the rigid motion that it has on average over the brain: it would be an unknown pose.
+/// @param brain        d x h x w, 1 in the given brain, centred
+/// @param position     of the output voxels from the brain's centre, mm, per axis (x, y, z)
+/// @param scale        by which the brain grows before it is deformed
+/// @param displacement 3 x z x y x x, in the given brain, mm
+void take_out_rigid_part(const torch::Tensor& brain, double brain_mm, const std::array<torch::Tensor, 3>& position,
+                         const Eigen::Vector3d& scale, double resolution_mm, torch::Tensor* displacement) {
+  // The field is smooth: voxels a few mm apart tell as much as all of them.
+  constexpr double kSpacingMm = 4.;
+  const auto every = std::max<std::int64_t>(1, std::llround(kSpacingMm / resolution_mm));
+  const auto thinned = [every](const torch::Tensor& tensor, int axis) {
+    return tensor.slice(axis, 0, c10::nullopt, every);
+  };
+  // In the given brain, and in grid_sample's coordinates; x, y, z along the last axis.
+  std::vector<torch::Tensor> along, sampled_at;
+  for (int axis = 2; axis >= 0; --axis) {
+    along.push_back((thinned(position[static_cast<std::size_t>(axis)], 0) / scale[axis]).to(torch::kFloat32));
+    sampled_at.push_back(along.back() / (0.5 * static_cast<double>(brain.size(2 - axis) - 1) * brain_mm));
+  }
+  const auto points_of = [&](const std::vector<torch::Tensor>& axes) {
+    std::vector<torch::Tensor> grids = torch::meshgrid(axes, "ij");
+    std::reverse(grids.begin(), grids.end());
+    return torch::stack(grids, -1).to(brain.device());
+  };
+  const torch::Tensor weight =
+      F::grid_sample(brain.unsqueeze(0).unsqueeze(0), points_of(sampled_at).unsqueeze(0),
+                     F::GridSampleFuncOptions().mode(torch::kBilinear).padding_mode(torch::kZeros).align_corners(true))
+          .flatten()
+          .to(torch::kFloat64);
+  const torch::Tensor points = points_of(along).view({-1, 3}).to(torch::kFloat64);
+  const torch::Tensor moved =
+      thinned(thinned(thinned(*displacement, 1), 2), 3).flatten(1).t().to(torch::kFloat64).contiguous();
+  const torch::Tensor total = weight.sum().clamp_min(1e-6);
+  const torch::Tensor centre = torch::matmul(weight, points) / total, shift = torch::matmul(weight, moved) / total;
+  const torch::Tensor weighted = ((points - centre) * weight.unsqueeze(1)).t();
+  const torch::Tensor spread = torch::matmul(weighted, points - centre).cpu();
+  const torch::Tensor turned = torch::matmul(weighted, moved - shift).cpu();
+  const auto matrix = [](const torch::Tensor& tensor) {
+    return Eigen::Matrix3d(
+        Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(tensor.contiguous().data_ptr<double>()));
+  };
+  const Eigen::Matrix3d second = matrix(spread), cross = matrix(turned);
+  const Eigen::Matrix3d inertia = second.trace() * Eigen::Matrix3d::Identity() - second;
+  const Eigen::Vector3d moment(cross(1, 2) - cross(2, 1), cross(2, 0) - cross(0, 2), cross(0, 1) - cross(1, 0));
+  const Eigen::Vector3d rotation = inertia.ldlt().solve(moment);
+  // d - shift - rotation x (p - centre), axis by axis
+  const torch::Tensor centre_cpu = centre.cpu(), shift_cpu = shift.cpu();
+  const auto from_centre = [&](int axis) {
+    std::array<std::int64_t, 3> view{1, 1, 1};
+    view[static_cast<std::size_t>(2 - axis)] = -1;
+    return (position[static_cast<std::size_t>(axis)] / scale[axis] - centre_cpu[axis].item<double>())
+        .to(torch::kFloat32)
+        .view(view)
+        .to(brain.device());
+  };
+  for (int axis = 0; axis < 3; ++axis) {
+    const int next = (axis + 1) % 3, last = (axis + 2) % 3;
+    displacement->select(0, axis)
+        .sub_(shift_cpu[axis].item<double>())
+        .sub_(from_centre(last), rotation[next])
+        .add_(from_centre(next), rotation[last]);
+  }
+}
+
 }  // namespace
 
 AnatomyOptions no_anatomy_variation() {
@@ -145,7 +209,7 @@ Anatomy AnatomySource::make(std::uint64_t seed, std::uint64_t number) const {
         (torch::arange(count[a], torch::kFloat64) + (static_cast<double>(first[a]) - middle)) * grid_.resolution_mm;
   }
 
-  // Smooth deformation on a lattice of control points; its rigid part is taken out, or it would be an unknown pose.
+  // Smooth deformation on a lattice of control points.
   torch::Tensor displacement;  // 3 x z x y x x, mm
   if (options_.elastic_mm > 0.) {
     std::array<std::int64_t, 3> points{};
@@ -154,33 +218,16 @@ Anatomy AnatomySource::make(std::uint64_t seed, std::uint64_t number) const {
       points[a] = spline_points(reach[static_cast<int>(a)], options_.elastic_spacing_mm);
       basis[a] = spline_matrix(position[a], points[a], options_.elastic_spacing_mm);
     }
-    const std::int64_t total = points[0] * points[1] * points[2];
-    Eigen::Matrix3Xd node(3, total), moved(3, total);
-    std::int64_t i = 0;
-    for (std::int64_t k = 0; k < points[2]; ++k)
-      for (std::int64_t j = 0; j < points[1]; ++j)
-        for (std::int64_t l = 0; l < points[0]; ++l, ++i) {
-          node.col(i) << static_cast<double>(2 * l - points[0] + 1), static_cast<double>(2 * j - points[1] + 1),
-              static_cast<double>(2 * k - points[2] + 1);
-          moved.col(i) = random.normal3(options_.elastic_mm / kSplineDeviation);
-        }
-    moved.colwise() -= moved.rowwise().mean().eval();
-    Eigen::Matrix3d inertia = Eigen::Matrix3d::Zero();
-    Eigen::Vector3d moment = Eigen::Vector3d::Zero();
-    for (std::int64_t n = 0; n < total; ++n) {
-      const Eigen::Vector3d p = node.col(n);
-      inertia += p.squaredNorm() * Eigen::Matrix3d::Identity() - p * p.transpose();
-      moment += p.cross(Eigen::Vector3d(moved.col(n)));
-    }
-    const Eigen::Vector3d rotation = inertia.ldlt().solve(moment);
     torch::Tensor coefficients = torch::empty({3, points[2], points[1], points[0]}, torch::kFloat32);
+    const std::int64_t total = points[0] * points[1] * points[2];
     float* out = coefficients.data_ptr<float>();
     for (std::int64_t n = 0; n < total; ++n) {
-      const Eigen::Vector3d rest = moved.col(n) - rotation.cross(Eigen::Vector3d(node.col(n)));
-      for (int axis = 0; axis < 3; ++axis) out[axis * total + n] = static_cast<float>(rest[axis]);
+      const Eigen::Vector3d drawn = random.normal3(options_.elastic_mm / kSplineDeviation);
+      for (int axis = 0; axis < 3; ++axis) out[axis * total + n] = static_cast<float>(drawn[axis]);
     }
     displacement =
         apply_axes(coefficients.to(device_), {basis[2].to(device_), basis[1].to(device_), basis[0].to(device_)});
+    take_out_rigid_part(source.channels[0], source.resolution_mm, position, scale, grid_.resolution_mm, &displacement);
   }
 
   // Where each output voxel comes from, in grid_sample's coordinates.

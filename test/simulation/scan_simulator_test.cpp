@@ -267,6 +267,56 @@ TEST(AnatomySource, ARimIsAsThickAsItsMeanSays) {
   EXPECT_NEAR(sum / kBrains, 4., 1.);
 }
 
+TEST(AnatomySource, ADeformationNeitherTurnsNorShiftsTheBrain) {
+  // Brains whose intensity is a coordinate say where each voxel of the deformed brain comes from.
+  NetworkGrid grid;
+  grid.volume_shape = {64, 64, 64};
+  grid.resolution_mm = 2.;
+  const torch::Tensor axis = (torch::arange(64, torch::kFloat32) - 31.5) * 2.;  // mm
+  const std::vector<torch::Tensor> coordinates = {axis.view({1, 1, 64}).expand({64, 64, 64}),
+                                                  axis.view({1, 64, 1}).expand({64, 64, 64}),
+                                                  axis.view({64, 1, 1}).expand({64, 64, 64})};
+  const torch::Tensor inside = (coordinates[0] / 36.).square() + ((coordinates[1] - 6.) / 46.).square() +
+                                   ((coordinates[2] + 4.) / 34.).square() <
+                               1.;
+  constexpr double kOffsetMm = 100.;  // intensities are not negative
+  AnatomyOptions options = no_anatomy_variation();
+  options.elastic_mm = 2.5;
+  std::vector<AnatomySource> still, deformed;
+  for (const torch::Tensor& coordinate : coordinates) {
+    BrainVolume brain;
+    brain.name = "ramp";
+    brain.image = coordinate + kOffsetMm;
+    brain.mask = inside;
+    brain.resolution_mm = 2.;
+    still.emplace_back(std::vector<BrainVolume>{brain}, grid, no_anatomy_variation(), torch::kCPU);
+    deformed.emplace_back(std::vector<BrainVolume>{brain}, grid, options, torch::kCPU);
+  }
+  for (std::uint64_t number = 0; number < 4; ++number) {
+    const torch::Tensor mask = deformed[0].make(7, number).mask & inside;
+    std::vector<torch::Tensor> from, to;
+    for (std::size_t a = 0; a < 3; ++a) {
+      const Anatomy before = still[a].make(7, number);
+      const torch::Tensor there = before.image.masked_select(inside), at = coordinates[a].masked_select(inside);
+      const double unit = ((at + kOffsetMm).sum() / there.sum()).item<double>();
+      to.push_back(coordinates[a].masked_select(mask));
+      from.push_back(deformed[a].make(7, number).image.masked_select(mask) * unit - kOffsetMm);
+    }
+    const torch::Tensor p = torch::stack(to).to(torch::kFloat64), q = torch::stack(from).to(torch::kFloat64);
+    const torch::Tensor moved = q - p;
+    EXPECT_NEAR(moved.square().mean().sqrt().item<double>(), options.elastic_mm, 1.);
+    EXPECT_LT(moved.mean(1).norm().item<double>(), 0.4) << "mm, brain " << number;
+    // The rotation by which the voxels' displacement is explained best: small angles.
+    const torch::Tensor lever = p - p.mean(1, true), rest = moved - moved.mean(1, true);
+    const torch::Tensor second = torch::matmul(lever, lever.t()), cross = torch::matmul(lever, rest.t());
+    const torch::Tensor inertia = second.trace() * torch::eye(3, torch::kFloat64) - second;
+    const torch::Tensor moment =
+        torch::stack({cross[1][2] - cross[2][1], cross[2][0] - cross[0][2], cross[0][1] - cross[1][0]});
+    const torch::Tensor rotation = torch::matmul(inertia.inverse(), moment);
+    EXPECT_LT(rotation.norm().item<double>() * 180. / M_PI, 0.4) << "degrees, brain " << number;
+  }
+}
+
 TEST(ScanSimulator, RefusesWhatDoesNotFit) {
   const auto message = [](const SimulatorOptions& options, const std::vector<BrainVolume>& volumes) {
     try {
