@@ -356,14 +356,39 @@ void plot_curves(const std::filesystem::path& path, const std::string& title, co
   write_file(path, curves_png(title, x_label, y_label, curves));
 }
 
+namespace {
+
+void draw_line(cv::Mat& image, const std::vector<cv::Point>& points, const cv::Scalar& colour, bool dashed) {
+  if (!dashed) {
+    cv::polylines(image, points, false, colour, 2, cv::LINE_AA);
+    return;
+  }
+  constexpr double kDash = 9., kPeriod = 15.;  // pixels along the line
+  double gone = 0.;
+  for (std::size_t i = 0; i + 1 < points.size(); ++i) {
+    const cv::Point2d from = points[i], way = cv::Point2d(points[i + 1]) - from;
+    const double length = cv::norm(way);
+    for (double begin = -std::fmod(gone, kPeriod); begin < length; begin += kPeriod) {
+      const double first = std::max(begin, 0.), last = std::min(begin + kDash, length);
+      if (last > first)
+        cv::line(image, from + way * (first / length), from + way * (last / length), colour, 2, cv::LINE_AA);
+    }
+    gone += length;
+  }
+}
+
+}  // namespace
+
 std::string curves_png(const std::string& title, const std::string& x_label, const std::string& y_label,
                        const std::vector<Curve>& curves) {
   std::vector<double> heights;
   double x_end = 0.;
+  bool counted = true;
   for (const Curve& curve : curves) {
     for (const auto& [x, y] : curve.points) {
       if (!std::isfinite(x) || !std::isfinite(y)) continue;
       x_end = std::max(x_end, x);
+      counted = counted && x == std::round(x);
       heights.push_back(y);
     }
   }
@@ -394,7 +419,9 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
     cv::line(image, at(0., y), {right, at(0., y).y}, kGrid, 1);
     put_text(image, number_label(y), at(0., y) + cv::Point(-10, 6), 0.5, kInk, Align::right);
   }
-  for (double x = 0.; x <= x_end; x += tick_step(x_end)) {
+  // Things that are counted have no halves.
+  const double x_step = counted ? std::max(1., tick_step(x_end)) : tick_step(x_end);
+  for (double x = 0.; x <= x_end; x += x_step) {
     cv::line(image, {at(x, 0.).x, bottom}, {at(x, 0.).x, bottom + 6}, kInk, 1);
     put_text(image, number_label(x), {at(x, 0.).x, bottom + 26}, 0.5, kInk, Align::centre);
   }
@@ -418,13 +445,14 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
                                               cv::Scalar(60, 190, 150)};
   for (std::size_t i = 0; i < curves.size(); ++i) {
     const cv::Scalar& colour = colours[i % colours.size()];
+    const bool dashed = i >= colours.size();  // colours come a second time
     std::vector<cv::Point> line;
     for (const auto& [x, y] : curves[i].points)
       if (std::isfinite(x) && std::isfinite(y)) line.push_back(at(x, y));
-    if (!curves[i].dots) cv::polylines(image, line, false, colour, 2, cv::LINE_AA);
+    if (!curves[i].dots) draw_line(image, line, colour, dashed);
     if (curves[i].dots || line.size() == 1)
       for (const cv::Point& point : line) draw_dot(image, point, colour);
-    cv::line(image, places[i], places[i] + cv::Point(30, 0), colour, 3);
+    draw_line(image, {places[i], places[i] + cv::Point(30, 0)}, colour, dashed);
     put_text(image, ascii(curves[i].name, 40), places[i] + cv::Point(38, 6), 0.52, kInk);
   }
   return encode_png(image);

@@ -134,6 +134,26 @@ TEST_F(Plots, SameBytesForTheSameInput) {
   EXPECT_EQ(read(path("c.png")), read(path("d.png")));
 }
 
+TEST_F(Plots, CurvesOfTheSameColourAreToldApart) {
+  std::vector<Curve> curves;
+  for (int i = 0; i < 11; ++i) curves.push_back({"c", {{0., 11. - i}, {10., 11. - i}}});
+  plot_curves(path("c.png"), "title", "step", "loss", curves);
+  const cv::Mat image = cv::imread(path("c.png").string());
+  ASSERT_EQ(image.size(), cv::Size(1500, 720));
+  const auto blue_share = [&image](double value) {
+    const int y = 92 + 550 - static_cast<int>(std::lround(550. * value / (1.05 * 11.)));
+    int blue = 0;
+    for (int x = 200; x < 1400; ++x) {
+      const cv::Vec3b pixel = image.at<cv::Vec3b>(y, x);
+      blue += pixel[0] - pixel[2] > 100 ? 1 : 0;
+    }
+    return blue / 1200.;
+  };
+  EXPECT_GT(blue_share(11.), 0.99);  // the first
+  EXPECT_GT(blue_share(1.), 0.5);    // the eleventh has its colour, dashed
+  EXPECT_LT(blue_share(1.), 0.9);
+}
+
 TEST_F(Plots, CurvesLieWhereTheirValuesSay) {
   const double nan = std::numeric_limits<double>::quiet_NaN();
   plot_curves(path("c.png"), "title", "step", "loss", {{"flat", {{0., 2.}, {5., nan}, {10., 2.}}}, {"empty", {}}});
