@@ -242,8 +242,26 @@ void draw_square(cv::Mat& image, cv::Point at, const cv::Scalar& colour) {
 void draw_cross(cv::Mat& image, cv::Point at, const cv::Scalar& colour) {
   cv::drawMarker(image, at, colour, cv::MARKER_TILTED_CROSS, 12, 2, cv::LINE_AA);
 }
-void draw_dashes(cv::Mat& image, int from, int to, int y, const cv::Scalar& colour) {
-  for (int x = from; x < to; x += 16) cv::line(image, {x, y}, {std::min(x + 9, to), y}, colour, 2);
+/// Dashes along a line of any shape; they go on around its corners.
+void draw_dashes(cv::Mat& image, const std::vector<cv::Point>& points, const cv::Scalar& colour,
+                 int type = cv::LINE_8) {
+  constexpr double kDash = 9., kPeriod = 16.;  // pixels along the line
+  double gone = 0.;
+  for (std::size_t i = 0; i + 1 < points.size(); ++i) {
+    const cv::Point2d from = points[i], way = cv::Point2d(points[i + 1]) - from;
+    const double length = cv::norm(way);
+    for (double begin = -std::fmod(gone, kPeriod); begin < length; begin += kPeriod) {
+      const double first = std::max(begin, 0.), last = std::min(begin + kDash, length);
+      if (last > first) cv::line(image, from + way * (first / length), from + way * (last / length), colour, 2, type);
+    }
+    gone += length;
+  }
+}
+void draw_curve(cv::Mat& image, const std::vector<cv::Point>& points, const cv::Scalar& colour, bool dashed) {
+  if (dashed)
+    draw_dashes(image, points, colour, cv::LINE_AA);
+  else
+    cv::polylines(image, points, false, colour, 2, cv::LINE_AA);
 }
 
 }  // namespace
@@ -286,7 +304,7 @@ void plot_latency(const std::filesystem::path& path, const Journal& journal) {
 
   if (tr_ms > 0.) {
     const int y = axes.y(tr_ms);
-    draw_dashes(image, frame.x, frame.x + frame.width, y, kInk);
+    draw_dashes(image, {{frame.x, y}, {frame.x + frame.width, y}}, kInk);
   }
   const auto& entries = journal.entries();
   std::map<std::string, std::size_t> drawn;
@@ -326,7 +344,10 @@ void plot_latency(const std::filesystem::path& path, const Journal& journal) {
   if (tr_ms > 0.)
     entry(
         "repetition time " + tick_label(tr_ms) + " ms",
-        [&](cv::Point at) { draw_dashes(image, at.x - 6, at.x + 35, at.y, kInk); }, 46);
+        [&](cv::Point at) {
+          draw_dashes(image, {at - cv::Point(6, 0), at + cv::Point(35, 0)}, kInk);
+        },
+        46);
   if (entries.empty()) put_text(image, "no arrivals", {frame.x + frame.width / 2, 360}, 1., kInk, Align::centre);
   write_png(path, image);
 }
@@ -355,29 +376,6 @@ void plot_curves(const std::filesystem::path& path, const std::string& title, co
                  const std::string& y_label, const std::vector<Curve>& curves) {
   write_file(path, curves_png(title, x_label, y_label, curves));
 }
-
-namespace {
-
-void draw_line(cv::Mat& image, const std::vector<cv::Point>& points, const cv::Scalar& colour, bool dashed) {
-  if (!dashed) {
-    cv::polylines(image, points, false, colour, 2, cv::LINE_AA);
-    return;
-  }
-  constexpr double kDash = 9., kPeriod = 15.;  // pixels along the line
-  double gone = 0.;
-  for (std::size_t i = 0; i + 1 < points.size(); ++i) {
-    const cv::Point2d from = points[i], way = cv::Point2d(points[i + 1]) - from;
-    const double length = cv::norm(way);
-    for (double begin = -std::fmod(gone, kPeriod); begin < length; begin += kPeriod) {
-      const double first = std::max(begin, 0.), last = std::min(begin + kDash, length);
-      if (last > first)
-        cv::line(image, from + way * (first / length), from + way * (last / length), colour, 2, cv::LINE_AA);
-    }
-    gone += length;
-  }
-}
-
-}  // namespace
 
 std::string curves_png(const std::string& title, const std::string& x_label, const std::string& y_label,
                        const std::vector<Curve>& curves) {
@@ -449,10 +447,10 @@ std::string curves_png(const std::string& title, const std::string& x_label, con
     std::vector<cv::Point> line;
     for (const auto& [x, y] : curves[i].points)
       if (std::isfinite(x) && std::isfinite(y)) line.push_back(at(x, y));
-    if (!curves[i].dots) draw_line(image, line, colour, dashed);
+    if (!curves[i].dots) draw_curve(image, line, colour, dashed);
     if (curves[i].dots || line.size() == 1)
       for (const cv::Point& point : line) draw_dot(image, point, colour);
-    draw_line(image, {places[i], places[i] + cv::Point(30, 0)}, colour, dashed);
+    draw_curve(image, {places[i], places[i] + cv::Point(30, 0)}, colour, dashed);
     put_text(image, ascii(curves[i].name, 40), places[i] + cv::Point(38, 6), 0.52, kInk);
   }
   return encode_png(image);
