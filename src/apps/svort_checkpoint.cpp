@@ -2,8 +2,10 @@
 
 #include <torch/types.h>
 
+#include <filesystem>
 #include <iomanip>
 #include <iostream>
+#include <map>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -20,13 +22,13 @@ constexpr const char* kUsage =
     "usage: svort_checkpoint info FILE\n"
     "       svort_checkpoint parameters NETWORK\n"
     "       svort_checkpoint untrained NETWORK FILE\n"
-    "       svort_checkpoint join FIRST SHARED FILE\n"
+    "       svort_checkpoint join BASE PART=FILE... OUT\n"
     "  info        checks a file completely (hash, network, options, every parameter) and prints what it says\n"
     "  parameters  names and shapes of a network's parameters, as JSON\n"
     "  untrained   writes v1 or v2 with weights that follow from a rule: to test programs, not to register anything\n"
-    "  join        writes a live network with the first network of one file and the shared network of the other, "
-    "which\n"
-    "              were trained apart (docs/training.md)\n";
+    "  join        writes a live network whose parts were trained apart (docs/training.md): BASE, but for the parts "
+    "that\n"
+    "              other files give; PART is first, shared or frame\n";
 
 struct UsageError : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -73,8 +75,17 @@ void write_untrained(const std::string& name, const std::string& file) {
   svort::save_network(file, network, {{"untrained", "weights follow from a rule and have learnt nothing"}});
 }
 
-void join(const std::string& first, const std::string& shared, const std::string& file) {
-  const svort::JoinedNetwork joined = svort::join_live_networks(first, shared);
+/// @param arguments BASE PART=FILE... OUT
+void join(const std::vector<std::string>& arguments) {
+  std::map<std::string, std::filesystem::path> parts;
+  for (std::size_t i = 1; i + 1 < arguments.size(); ++i) {
+    const std::size_t equal = arguments[i].find('=');
+    if (equal == std::string::npos) throw UsageError("'" + arguments[i] + "' is not PART=FILE");
+    if (!parts.emplace(arguments[i].substr(0, equal), arguments[i].substr(equal + 1)).second)
+      throw UsageError("'" + arguments[i] + "' gives a part a second time");
+  }
+  const std::string& file = arguments.back();
+  const svort::JoinedNetwork joined = svort::join_live_networks(arguments.front(), parts);
   svort::save_network(file, joined.network, joined.provenance, svort::WeightPrecision::half);
 }
 
@@ -86,8 +97,8 @@ void run(const std::vector<std::string>& arguments) {
     print_parameters(arguments[1]);
   else if (command == "untrained" && arguments.size() == 3)
     write_untrained(arguments[1], arguments[2]);
-  else if (command == "join" && arguments.size() == 4)
-    join(arguments[1], arguments[2], arguments[3]);
+  else if (command == "join" && arguments.size() >= 4)
+    join({arguments.begin() + 1, arguments.end()});
   else
     throw UsageError(command.empty() ? "a command is missing" : "'" + command + "' is unknown, or its arguments are");
 }

@@ -1,6 +1,7 @@
 #include "svort_ros/geometry/rigid_fit.h"
 
 #include <Eigen/Geometry>
+#include <Eigen/SVD>
 #include <algorithm>
 #include <array>
 #include <stdexcept>
@@ -65,6 +66,24 @@ Pose fit_most_planes(const std::vector<Pose>& from, const std::vector<Pose>& to,
     fit = fit_planes(close_from, close_to, half_field_mm);
   }
   return fit;
+}
+
+Pose fit_points(const Eigen::Matrix3Xd& from, const Eigen::Matrix3Xd& to, const Eigen::VectorXd& weights) {
+  if (from.cols() != to.cols() || from.cols() != weights.size())
+    throw std::invalid_argument("fit_points: " + std::to_string(from.cols()) + " and " + std::to_string(to.cols()) +
+                                " points with " + std::to_string(weights.size()) + " weights");
+  const double sum = weights.sum();
+  if (!(sum > 0.)) return Pose::Identity();
+  const Eigen::Vector3d from_mean = from * weights / sum, to_mean = to * weights / sum;
+  const Eigen::Matrix3d covariance =
+      (to.colwise() - to_mean) * weights.asDiagonal() * (from.colwise() - from_mean).transpose();
+  const Eigen::JacobiSVD<Eigen::Matrix3d> svd(covariance, Eigen::ComputeFullU | Eigen::ComputeFullV);
+  // A rotation, also where a reflection would come closer.
+  const double sign = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0. ? -1. : 1.;
+  Pose motion = Pose::Identity();
+  motion.linear() = svd.matrixU() * Eigen::Vector3d(1., 1., sign).asDiagonal() * svd.matrixV().transpose();
+  motion.translation() = to_mean - motion.linear() * from_mean;
+  return motion;
 }
 
 double plane_distance(const Pose& a, const Pose& b, double half_field_mm) {

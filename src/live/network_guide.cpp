@@ -33,26 +33,31 @@ NetworkGuide::NetworkGuide(const NetworkInstance& network, const Checkpoint& abo
   network_->eval();
 }
 
-torch::Tensor NetworkGuide::features(const SliceSequence& sequence) {
-  std::map<std::shared_ptr<const PreparedSlice>, torch::Tensor> kept;
-  std::vector<torch::Tensor> rows;
+NetworkGuide::Encoded NetworkGuide::encoded(const SliceSequence& sequence) {
+  std::map<std::shared_ptr<const PreparedSlice>, Encoded> kept;
+  std::vector<torch::Tensor> features, reduced;
   for (const auto& slice : sequence.slices()) {
     auto found = encoded_.find(slice);
     if (found == encoded_.end()) {
-      found = encoded_.emplace(slice, network_->encode(pixel_tensor(*slice), slice->resolution)).first;
+      const torch::Tensor pixels = pixel_tensor(*slice);
+      Encoded row = {network_->encode(pixels, slice->resolution), {}};
+      // A copy: where nothing is averaged, the slice's own memory would be kept.
+      row.reduced = network_->reduce(pixels, slice->resolution).clone();
+      found = encoded_.emplace(slice, std::move(row)).first;
       ++count_;
     }
-    rows.push_back(found->second);
+    features.push_back(found->second.features);
+    reduced.push_back(found->second.reduced);
     kept.insert(*found);
   }
   encoded_ = std::move(kept);
-  return torch::cat(rows);
+  return {torch::cat(features), torch::cat(reduced)};
 }
 
 std::vector<Pose> NetworkGuide::place(const SliceSequence& sequence) {
   const torch::NoGradGuard no_grad;
   const NetworkInput input = network_geometry(sequence);
-  return poses_from_tensor(network_->place(features(sequence), input));
+  return poses_from_tensor(network_->place(encoded(sequence).features, input));
 }
 
 NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, const std::vector<Pose>& T_brain_crop) {
@@ -72,7 +77,8 @@ NetworkGuide::Frame NetworkGuide::find_frame(const SliceSequence& sequence, cons
   std::vector<Pose> T_centred_crop;
   for (const Pose& pose : T_brain_crop) T_centred_crop.push_back(T_centred_brain * pose);
   input.transforms = tensor_from_poses(T_centred_crop);
-  const LiveFrame frame = network_->find_frame(features(sequence), input);
+  const Encoded slices = encoded(sequence);
+  const LiveFrame frame = network_->find_frame(slices.features, slices.reduced, input);
   return {pose_from_tensor(frame.motion) * T_centred_brain, frame.agreement};
 }
 

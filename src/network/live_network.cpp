@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <stdexcept>
 #include <string>
 
@@ -24,6 +25,8 @@ constexpr int kNormGroups = 8;
 constexpr int kStages = 3;
 constexpr int kCoordinates = 2;
 constexpr int kStemKernel = 6;
+constexpr int kFrameStemKernel = 4;
+constexpr std::int64_t kFrameCell = 8;  // voxels along each side
 
 void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument("LiveNetwork: " + message);
@@ -42,6 +45,16 @@ torch::Tensor convolve(const nn::Conv2d& module, const torch::Tensor& x) {
   const std::int64_t kernel = module->options.kernel_size()->at(0);
   const std::int64_t padding = kernel == kStemKernel ? 1 : kernel / 2;
   return torch::conv2d(x, module->weight.to(x.scalar_type()), {}, module->options.stride(), padding);
+}
+
+nn::Conv3d convolution_3d(std::int64_t in, std::int64_t out, int kernel, int stride) {
+  return nn::Conv3d(nn::Conv3dOptions(in, out, kernel).stride(stride).bias(false));
+}
+
+torch::Tensor convolve_3d(const nn::Conv3d& module, const torch::Tensor& x) {
+  const std::int64_t kernel = module->options.kernel_size()->at(0);
+  const std::int64_t padding = kernel == kFrameStemKernel ? 1 : kernel / 2;
+  return torch::conv3d(x, module->weight.to(x.scalar_type()), {}, module->options.stride(), padding);
 }
 
 torch::Tensor normalise(const nn::GroupNorm& module, const torch::Tensor& x) {
@@ -117,6 +130,51 @@ torch::Tensor LiveEncoderImpl::forward(const torch::Tensor& images, torch::Scala
   return out_(x.flatten(1).to(torch::kFloat32));
 }
 
+// ---------------------------------------------------------------------------------------------------- frame network
+
+LiveFrameNetworkImpl::LiveFrameNetworkImpl(const LiveNetworkOptions& options) {
+  const std::int64_t width = options.frame_width;
+  stem_ = register_module("stem", convolution_3d(1, width, kFrameStemKernel, 2));
+  stem_norm_ = register_module("stem_norm", group_norm(width));
+  const auto add = [this](std::int64_t in, std::int64_t out, int stride) {
+    const std::string name = "block" + std::to_string(blocks_.size()) + "_";
+    Block block;
+    block.first = register_module(name + "first", convolution_3d(in, out, 3, stride));
+    block.first_norm = register_module(name + "first_norm", group_norm(out));
+    block.second = register_module(name + "second", convolution_3d(out, out, 3, 1));
+    block.second_norm = register_module(name + "second_norm", group_norm(out));
+    nn::init::zeros_(block.second_norm->weight);
+    if (in != out || stride != 1)
+      block.shortcut = register_module(name + "shortcut", convolution_3d(in, out, 1, stride));
+    blocks_.push_back(block);
+  };
+  // Down to the cells, and from there on each cell hears of the others, and of where it is.
+  add(width, 2 * width, 2);
+  add(2 * width, 4 * width, 2);
+  add(4 * width + 3, 4 * width, 1);
+  add(4 * width, 4 * width, 1);
+  out_ = register_module("out", nn::Conv3d(nn::Conv3dOptions(4 * width, 4, 1)));
+  nn::init::zeros_(out_->weight);  // it starts by leaving the frame as it is
+  nn::init::zeros_(out_->bias);
+}
+
+LiveFrameOutput LiveFrameNetworkImpl::forward(const torch::Tensor& volumes, torch::ScalarType precision) {
+  torch::Tensor x = torch::relu(normalise(stem_norm_, convolve_3d(stem_, volumes.to(precision))));
+  for (std::size_t i = 0; i < blocks_.size(); ++i) {
+    const Block& block = blocks_[i];
+    if (i == 2) {
+      const torch::Tensor axis = torch::linspace(-1., 1., x.size(4), x.options());
+      const std::vector<torch::Tensor> zyx = torch::meshgrid({axis, axis, axis}, "ij");
+      x = torch::cat({x, torch::stack(zyx).unsqueeze(0).expand({x.size(0), 3, -1, -1, -1})}, 1);
+    }
+    torch::Tensor y = torch::relu(normalise(block.first_norm, convolve_3d(block.first, x)));
+    y = normalise(block.second_norm, convolve_3d(block.second, y));
+    x = torch::relu(y + (block.shortcut ? convolve_3d(block.shortcut, x) : x));
+  }
+  const torch::Tensor said = out_(x.to(torch::kFloat32)).flatten(2);
+  return {said.slice(1, 0, 3).transpose(1, 2), said.select(1, 3)};
+}
+
 // ------------------------------------------------------------------------------------------------------ Transformer
 
 LiveTransformerImpl::LiveTransformerImpl(const LiveNetworkOptions& options) : heads_(options.heads) {
@@ -172,6 +230,10 @@ LiveNetwork::LiveNetwork(const LiveNetworkOptions& options) : PoseNetwork("live"
           "dim is " + std::to_string(o.dim) + "; it must be a multiple of heads, which is " + std::to_string(o.heads));
   require(o.layers >= 1 && o.layers <= 48, "layers must be 1 to 48");
   require(o.hidden >= 1 && o.hidden <= 16384, "hidden must be 1 to 16384");
+  require(
+      o.frame_width == 0 || (o.frame_width >= kNormGroups && o.frame_width % kNormGroups == 0 && o.frame_width <= 128),
+      "frame_width is " + std::to_string(o.frame_width) + "; it must be 0 or a multiple of 8 up to 128");
+  require(o.frame_steps >= 0 && o.frame_steps <= 100, "frame_steps must be 0 to 100");
   require(o.iterations >= 1 && o.iterations <= 100, "iterations must be 1 to 100");
 
   const int first_channels = 1 + kCoordinates;
@@ -188,6 +250,7 @@ LiveNetwork::LiveNetwork(const LiveNetworkOptions& options) : PoseNetwork("live"
     shared_position_ = register_module("shared_position", nn::Linear(kPositionLength, o.dim));
   }
   if (o.pulls) shared_pulls_ = register_module("shared_pulls", nn::Linear(kPullsLength, o.dim));
+  if (o.frame_width > 0) frame_network_ = register_module("frame_network", LiveFrameNetwork(o));
   // The shared network starts by going where the last level of registration does, or, without pulls, by staying.
   nn::init::zeros_(shared_head_->weight);
   nn::init::zeros_(shared_head_->bias);
@@ -225,11 +288,14 @@ void require_features(const torch::Tensor& features, std::int64_t dim, const Net
           "features must be n x " + std::to_string(dim) + ", one row per slice");
 }
 
-// Mean intensity of the brain to 1, slice by slice, for the slice and whatever belongs to it; n x c x p x p.
+// Mean intensity of the brain to 1, slice by slice, for the slice and whatever belongs to it; n x c x p x p, or, volume
+// by volume, n x 1 x d x d x d.
 torch::Tensor normalised(const torch::Tensor& images) {
   const torch::Tensor slice = images.slice(1, 0, 1);
-  const torch::Tensor count = (slice > 0).sum({1, 2, 3}, /*keepdim=*/true).clamp_min(1);
-  const torch::Tensor mean = slice.sum({1, 2, 3}, /*keepdim=*/true) / count;
+  std::vector<std::int64_t> all(static_cast<std::size_t>(images.dim()) - 1);
+  std::iota(all.begin(), all.end(), 1);
+  const torch::Tensor count = (slice > 0).sum(all, /*keepdim=*/true).clamp_min(1);
+  const torch::Tensor mean = slice.sum(all, /*keepdim=*/true) / count;
   return images / mean.clamp_min(1e-6);
 }
 
@@ -324,12 +390,34 @@ torch::Tensor LiveNetwork::place(const torch::Tensor& features, const NetworkInp
   return compose_transforms(moving.to(input.transforms.device()), input.transforms);
 }
 
-LiveFrame LiveNetwork::find_frame(const torch::Tensor& features, const NetworkInput& placed) {
+LiveFrameOutput LiveNetwork::look_at_frames(const torch::Tensor& volumes) {
+  if (!frame_network_) throw std::logic_error("LiveNetwork: it has no frame network (frame_width is 0)");
+  const std::int64_t p = options_.input_px;
+  require(volumes.defined() && volumes.dim() == 5 && volumes.size(1) == 1 && volumes.size(2) == p &&
+              volumes.size(3) == p && volumes.size(4) == p,
+          "volumes must be b x 1 x d x d x d with d = " + std::to_string(p));
+  return frame_network_->forward(normalised(volumes), precision_);
+}
+
+LiveFrame LiveNetwork::find_frame(const torch::Tensor& features, const torch::Tensor& reduced,
+                                  const NetworkInput& placed) {
+  const torch::NoGradGuard no_grad;
   NetworkInput input = placed;
   input.common_frame = true;
   const PoseVotes votes = vote(features, input);
   const torch::Tensor motions = pose_consensus(votes, options_.consensus);
-  return {motions.slice(0, 0, 1).clone(), vote_agreement(votes, motions, options_.consensus)};
+  LiveFrame frame = {motions.slice(0, 0, 1).clone(), vote_agreement(votes, motions, options_.consensus)};
+  if (!frame_network_) return frame;
+  const torch::Device device = placed.transforms.device();
+  for (int step = 0; step < options_.frame_steps; ++step) {
+    const torch::Tensor now =
+        compose_transforms(frame.motion.to(device).expand_as(placed.transforms), placed.transforms);
+    const torch::Tensor volume = live_volume(reduced, now, options_, placed.thickness_mm, AcquisitionFormulation::fast)
+                                     .unsqueeze(0)
+                                     .unsqueeze(0);
+    frame.motion = compose_transforms(frame_motions(look_at_frames(volume), volume, options_), frame.motion);
+  }
+  return frame;
 }
 
 torch::Tensor LiveNetwork::encode_placed(const torch::Tensor& reduced, const torch::Tensor& simulated) {
@@ -395,7 +483,7 @@ std::vector<NetworkStep> LiveNetwork::run(const NetworkInput& input, const Netwo
       if (options_.pulls && options_.volume_conditioned) pulls = pull_live_slices(reduced, current, options_);
       const LiveOutput said = update(simulated, pulls, current, {}, &attention);
       current.transforms = apply_live_update(current.transforms, said.points, options_);
-      const torch::Tensor motion = find_frame(features, current).motion.to(current.transforms.device());
+      const torch::Tensor motion = find_frame(features, reduced, current).motion.to(current.transforms.device());
       current.transforms = compose_transforms(motion.expand_as(current.transforms), current.transforms);
       step.weights = torch::sigmoid(said.quality);
     }
@@ -443,6 +531,15 @@ PoseVotes live_votes(const LiveOutput& output, const NetworkInput& input, const 
 
 namespace {
 
+AcquisitionGeometry live_geometry(const torch::Tensor& transforms, const LiveNetworkOptions& options,
+                                  double thickness_mm) {
+  const double voxel = options.input_resolution_mm;
+  AcquisitionGeometry geometry;
+  geometry.psf = gaussian_psf({1., 1., thickness_mm / voxel});
+  geometry.transforms = change_resolution(transforms.detach().cpu(), 1., voxel);
+  return geometry;
+}
+
 /// The volume, made of the slices if there is none, seen from the slices' places.
 torch::Tensor look(const torch::Tensor& reduced, const AcquisitionGeometry& geometry, const torch::Tensor& given,
                    std::int64_t size, double voxel_mm, AcquisitionFormulation formulation) {
@@ -470,17 +567,59 @@ torch::Tensor look(const torch::Tensor& reduced, const AcquisitionGeometry& geom
 torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const torch::Tensor& transforms,
                                      const LiveNetworkOptions& options, double thickness_mm,
                                      AcquisitionFormulation formulation) {
-  const double voxel = options.input_resolution_mm;
-  AcquisitionGeometry geometry;
-  geometry.psf = gaussian_psf({1., 1., thickness_mm / voxel});
-  geometry.transforms = change_resolution(transforms.detach().cpu(), 1., voxel);
-  return look(reduced, geometry, {}, options.input_px, voxel, formulation);
+  return look(reduced, live_geometry(transforms, options, thickness_mm), {}, options.input_px,
+              options.input_resolution_mm, formulation);
+}
+
+torch::Tensor live_volume(const torch::Tensor& reduced, const torch::Tensor& transforms,
+                          const LiveNetworkOptions& options, double thickness_mm, AcquisitionFormulation formulation) {
+  const torch::NoGradGuard no_grad;
+  const torch::Tensor slices = reduced.cpu().contiguous();
+  AcquisitionMasks masks;
+  masks.slices = slices > 0;
+  const std::int64_t p = options.input_px;
+  const SliceAcquisition acquisition(live_geometry(transforms, options, thickness_mm), static_cast<int>(p),
+                                     static_cast<int>(p), {p, p, p}, formulation, masks);
+  return reconstruct_psf(slices, acquisition).to(reduced.device());
 }
 
 torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const AcquisitionGeometry& geometry,
                                      const torch::Tensor& volume, double voxel_mm, AcquisitionFormulation formulation) {
   require(volume.defined() && volume.dim() == 3, "the volume must be d x d x d");
   return look(reduced, geometry, volume, volume.size(0), voxel_mm, formulation);
+}
+
+torch::Tensor live_frame_cells(const LiveNetworkOptions& options) {
+  const std::int64_t cells = options.input_px / kFrameCell;
+  const torch::Tensor axis = (torch::arange(cells, torch::kFloat32) - 0.5 * static_cast<double>(cells - 1)) *
+                             (static_cast<double>(kFrameCell) * options.input_resolution_mm);
+  const std::vector<torch::Tensor> zyx = torch::meshgrid({axis, axis, axis}, "ij");
+  return torch::stack({zyx[2], zyx[1], zyx[0]}, 3).reshape({-1, 3});
+}
+
+torch::Tensor brain_in_frame_cells(const torch::Tensor& volumes) {
+  const torch::Tensor brain = (volumes.detach() > 0).to(torch::kFloat32);
+  return torch::avg_pool3d(brain, {kFrameCell, kFrameCell, kFrameCell}).flatten(1);
+}
+
+torch::Tensor frame_motions(const LiveFrameOutput& said, const torch::Tensor& volumes,
+                            const LiveNetworkOptions& options) {
+  const torch::NoGradGuard no_grad;
+  const torch::Tensor cells = live_frame_cells(options);
+  const torch::Tensor targets = cells + said.movement.detach().cpu() * kLiveUpdateUnitMm;
+  const torch::Tensor weights =
+      brain_in_frame_cells(volumes).cpu() * (-2. * said.log_scale.detach().cpu().clamp(-5., 5.)).exp();
+  const auto columns = [](const torch::Tensor& points) {  // c x 3 -> 3 x c
+    const torch::Tensor values = points.to(torch::kFloat64).contiguous();
+    return Eigen::Matrix3Xd(Eigen::Map<const Eigen::Matrix3Xd>(values.data_ptr<double>(), 3, values.size(0)));
+  };
+  std::vector<Pose> motions;
+  for (std::int64_t i = 0; i < volumes.size(0); ++i) {
+    const torch::Tensor weight = weights[i].to(torch::kFloat64).contiguous();
+    motions.push_back(fit_points(columns(cells), columns(targets[i]),
+                                 Eigen::Map<const Eigen::VectorXd>(weight.data_ptr<double>(), weight.size(0))));
+  }
+  return tensor_from_poses(motions);
 }
 
 LivePulls pull_live_slices(const torch::Tensor& reduced, const NetworkInput& input, const LiveNetworkOptions& options) {

@@ -13,7 +13,14 @@ namespace svort {
 namespace {
 
 // What random numbers are drawn for, so that a change in one place leaves the others as they were.
-enum Purpose : std::uint64_t { kWhichNetwork = 101, kWhichIteration = 102, kWarmStart = 103, kPullsUnknown = 104 };
+enum Purpose : std::uint64_t {
+  kWhichNetwork = 101,
+  kWhichIteration = 102,
+  kWarmStart = 103,
+  kPullsUnknown = 104,
+  kWhetherFrame = 105,
+  kFrameStart = 106
+};
 
 constexpr double kRadians = M_PI / 180.;
 
@@ -50,6 +57,17 @@ Batch batch_of(const std::vector<SimulatedScan>& scans) {
   batch.truth = torch::cat(truths);
   batch.good = torch::cat(bad).logical_not().to(torch::kFloat32);
   return batch;
+}
+
+/// Places off by a walk in acquisition order plus what each slice does on its own.
+torch::Tensor perturbed(const torch::Tensor& truth, RandomStream& random, double rotation, double translation) {
+  torch::Tensor walk = random_motion(random, rotation, translation), motions = torch::empty({truth.size(0), 6});
+  constexpr double kMemory = 0.9, kOwn = 0.3;
+  for (std::int64_t i = 0; i < truth.size(0); ++i) {
+    walk = kMemory * walk + std::sqrt(1. - kMemory * kMemory) * random_motion(random, rotation, translation);
+    motions[i] = walk + kOwn * random_motion(random, rotation, translation);
+  }
+  return compose_transforms(truth, axisangle_to_matrix(motions));
 }
 
 /// A scan's true poses, moved as one body to where most of its slices lie now: n x 3 x 4.
@@ -95,6 +113,11 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
     : network_(std::move(network)), options_(options), seed_(seed) {
   const auto share = [](double value) { return value >= 0. && value <= 1.; };
   const auto size = [](double value) { return value >= 0. && std::isfinite(value); };
+  require(share(options.frame_share), "frame_share", "0 to 1");
+  require(options.frame_share == 0. || network_->has_frame_network(), "frame_share",
+          "0, because network.frame_width is 0: there is no frame network");
+  require(size(options.frame_deg) && options.frame_deg <= 180., "frame_deg", "0 to 180 degrees");
+  require(size(options.frame_mm), "frame_mm", "zero or positive");
   require(share(options.first_share), "first_share", "0 to 1");
   require(share(options.placed_share), "placed_share", "0 to 1");
   require(share(options.second_update_share), "second_update_share", "0 to 1");
@@ -111,11 +134,12 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
 }
 
 std::vector<std::string> LiveRecipe::parts() const {
-  return {"first_points",  "first_mirrored", "first_scale",    "first_quality",
-          "shared_points", "shared_scale",   "shared_quality", "shared_start"};
+  return {"first_points",   "first_mirrored", "first_scale", "first_quality", "shared_points", "shared_scale",
+          "shared_quality", "shared_start",   "frame_cells", "frame_scale",   "frame_start",   "frame_left"};
 }
 
 StepLoss LiveRecipe::loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
+  if (RandomStream(seed_, step, kWhetherFrame).chance(options_.frame_share)) return frame_loss(scans, step);
   const Batch batch = batch_of(scans);
   if (RandomStream(seed_, step, kWhichNetwork).chance(options_.first_share)) {
     return first_loss(batch.input, batch.truth, batch.good, batch.lengths);
@@ -146,14 +170,7 @@ torch::Tensor LiveRecipe::warm_start(const SimulatedScan& scan, std::uint64_t st
   } else {
     // A walk in acquisition order plus what each slice does on its own, both of a size drawn for the scan.
     const double size = random.uniform();
-    const double walk_rotation = size * options_.perturb_deg * kRadians, walk_mm = size * options_.perturb_mm;
-    torch::Tensor walk = random_motion(random, walk_rotation, walk_mm), motions = torch::empty({n, 6});
-    constexpr double kMemory = 0.9, kOwn = 0.3;
-    for (std::int64_t i = 0; i < n; ++i) {
-      walk = kMemory * walk + std::sqrt(1. - kMemory * kMemory) * random_motion(random, walk_rotation, walk_mm);
-      motions[i] = walk + kOwn * random_motion(random, walk_rotation, walk_mm);
-    }
-    start = compose_transforms(scan.truth.cpu(), axisangle_to_matrix(motions));
+    start = perturbed(scan.truth.cpu(), random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
   }
   const torch::Tensor global =
       axisangle_to_matrix(random_motion(random, options_.global_deg * kRadians, options_.global_mm).unsqueeze(0));
@@ -218,6 +235,51 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   // What doing nothing would cost: the shared network has learnt something once it is below.
   loss.parts["shared_start"] =
       smooth_l1_loss(torch::zeros_like(target), target, options_.shared_beta).mean().item<double>();
+  return loss;
+}
+
+StepLoss LiveRecipe::frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
+  // A scan is costly to make and a second frame is not.
+  constexpr std::uint64_t kFramesPerScan = 2;
+  const LiveNetworkOptions& shape = network_->options();
+  const AnchorFrame frame = live_anchor_frame(shape);
+  const torch::Tensor cells = live_frame_cells(shape);
+  std::vector<torch::Tensor> volumes, targets;
+  for (std::size_t i = 0; i < scans.size(); ++i) {
+    const torch::Tensor truth = scans[i].truth.cpu();
+    const torch::Tensor reduced = network_->reduce(scans[i].input.slices, scans[i].input.slice_resolution_mm);
+    for (std::uint64_t k = 0; k < kFramesPerScan; ++k) {
+      RandomStream random(seed_, (step * 64 + i) * kFramesPerScan + k, kFrameStart);
+      // Most are small: this is how frames are voted, and what is left of them after a step.
+      const double size = std::pow(random.uniform(), 2), off = std::pow(random.uniform(), 2);
+      const torch::Tensor placed =
+          perturbed(truth, random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
+      const torch::Tensor motion = axisangle_to_matrix(
+          random_motion(random, off * options_.frame_deg * kRadians, off * options_.frame_mm).unsqueeze(0));
+      const torch::Tensor moved = compose_transforms(motion.expand_as(placed), placed);
+      volumes.push_back(live_volume(reduced, moved, shape, scans[i].input.thickness_mm, AcquisitionFormulation::fast));
+      // Where the best frame would leave it: what is wrong among the slices is none of the frame's business.
+      const Pose best =
+          fit_most_planes(poses_from_tensor(moved), poses_from_tensor(truth), 0.5 * frame.width * frame.resolution);
+      targets.push_back(transform_points(tensor_from_pose(best), cells.unsqueeze(0)).squeeze(0) - cells);
+    }
+  }
+  const torch::Tensor seen = torch::stack(volumes).unsqueeze(1).to(scans.front().truth.device());
+  const LiveFrameOutput said = network_->look_at_frames(seen);
+  const torch::Tensor target = (torch::stack(targets) / kLiveUpdateUnitMm).to(seen.device());
+  const torch::Tensor brain = brain_in_frame_cells(seen);
+  const torch::Tensor share = brain / brain.mean().clamp_min(1e-6);
+  const auto rows = [](const torch::Tensor& points) { return points.reshape({-1, 3}); };
+  const torch::Tensor points = smooth_l1_loss(rows(said.movement), rows(target), options_.shared_beta);
+  const torch::Tensor error = (said.movement - target).detach().norm(2, 2);
+  StepLoss loss = sum_of({{"frame_cells", 1., points * share.flatten()},
+                          {"frame_scale", options_.scale_weight, scale_loss(error, said.log_scale) * share}});
+  // Mean distance of brain from where it belongs, in the same unit: as found, and after what the cells say together.
+  const torch::Tensor moved =
+      (transform_points(frame_motions(said, seen, shape), cells.expand({seen.size(0), -1, 3})) - cells) /
+      kLiveUpdateUnitMm;
+  loss.parts["frame_start"] = (target.norm(2, 2) * share).mean().item<double>();
+  loss.parts["frame_left"] = ((target - moved.to(seen.device())).norm(2, 2) * share).mean().item<double>();
   return loss;
 }
 

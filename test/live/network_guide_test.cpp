@@ -25,7 +25,8 @@ NetworkInstance small_live() {
                                                         {"dim", std::int64_t{24}},
                                                         {"heads", std::int64_t{2}},
                                                         {"layers", std::int64_t{1}},
-                                                        {"hidden", std::int64_t{32}}});
+                                                        {"hidden", std::int64_t{32}},
+                                                        {"frame_width", std::int64_t{8}}});
   fill_deterministically(*network.module);
   return network;
 }

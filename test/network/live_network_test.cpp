@@ -102,7 +102,9 @@ void randomise(LiveNetwork& network) {
 constexpr double kRounding = 2e-5;
 
 TEST(LiveNetwork, DefaultsAreWithinTheLimitsOnSize) {
-  const LiveNetwork network;
+  LiveNetworkOptions options;
+  options.frame_width = 16;
+  const LiveNetwork network(options);
   std::int64_t count = 0;
   for (const torch::Tensor& parameter : network.parameters()) count += parameter.numel();
   EXPECT_LE(count, 8000000);
@@ -359,6 +361,123 @@ TEST(LiveNetwork, SimulatedChannelsShowTheVolumeAndItsSlopeAlongTheNormal) {
   EXPECT_EQ(seen.select(1, 0).masked_select(slices.select(1, 0) == 0).abs().max().item<float>(), 0.F);
 }
 
+// Slices of one brain, axis by axis, through a lopsided blob of an ellipsoid: (x, y, z) mm of the canonical frame.
+NetworkInput lopsided_brain() {
+  NetworkInput input = random_input(30);
+  torch::Tensor axisangle = torch::zeros({30, 6});
+  for (std::int64_t i = 0; i < 30; ++i) {
+    axisangle[i][i / 10] = i < 10 ? 0. : 0.5 * M_PI;  // about x for the first ten: it is 0; then y, z
+    axisangle[i][5] = 6. * (static_cast<double>(i % 10) - 4.5);
+  }
+  input.transforms = svort::axisangle_to_matrix(axisangle);
+  const torch::Tensor axis = (torch::arange(64) - 31.5) * 2.;
+  const std::vector<torch::Tensor> yx = torch::meshgrid({axis, axis}, "ij");
+  const torch::Tensor pixels =
+      torch::stack({yx[1], yx[0], torch::zeros_like(yx[0])}, 2).view({1, -1, 3}).to(torch::kFloat32);
+  const torch::Tensor at = svort::transform_points(input.transforms, pixels.expand({30, -1, 3}));
+  const torch::Tensor x = at.select(2, 0), y = at.select(2, 1), z = at.select(2, 2);
+  const torch::Tensor brain = (x / 30.).square() + (y / 40.).square() + (z / 25.).square() < 1.;
+  const torch::Tensor bright = (x - 10.).square() + (y - 15.).square() + (z - 5.).square() < 100.;
+  input.slices = (brain.to(torch::kFloat32) * (1. + bright)).to(torch::kFloat32).view({30, 1, 64, 64});
+  return input;
+}
+
+LiveNetworkOptions with_frame_network() {
+  LiveNetworkOptions options = small();
+  options.frame_width = 8;
+  return options;
+}
+
+TEST(LiveNetwork, CellsOfTheFrameNetworkTileTheVolume) {
+  const LiveNetworkOptions options = with_frame_network();
+  const torch::Tensor cells = svort::live_frame_cells(options);
+  ASSERT_EQ(cells.sizes(), (std::vector<std::int64_t>{512, 3}));
+  EXPECT_LT(cells.mean(0).abs().max().item<float>(), 1e-4F);
+  // x runs fastest: cells of 8 voxels of 2 mm.
+  EXPECT_TRUE(torch::allclose(cells[0], torch::tensor({-56.F, -56.F, -56.F})));
+  EXPECT_TRUE(torch::allclose(cells[1] - cells[0], torch::tensor({16.F, 0.F, 0.F})));
+  EXPECT_TRUE(torch::allclose(cells[64] - cells[0], torch::tensor({0.F, 0.F, 16.F})));
+  // A volume whose brightest voxel is known shows which cell is where.
+  torch::Tensor volume = torch::zeros({1, 1, 64, 64, 64});
+  volume.slice(2, 8, 16).slice(3, 0, 8).slice(4, 16, 20) = 1.;
+  const torch::Tensor brain = svort::brain_in_frame_cells(volume)[0];
+  EXPECT_EQ(brain.argmax().item<std::int64_t>(), 64 + 2);
+  EXPECT_FLOAT_EQ(brain.max().item<float>(), 0.5F);
+  EXPECT_FLOAT_EQ(brain.sum().item<float>(), 0.5F);
+}
+
+TEST(LiveNetwork, AVolumesVoxelsLieWhereItsCellsSay) {
+  // The blob is in the cell that is closest to it.
+  const NetworkInput input = lopsided_brain();
+  const LiveNetworkOptions options = with_frame_network();
+  const torch::Tensor volume =
+      svort::live_volume(input.slices, input.transforms, options, 3., svort::AcquisitionFormulation::fast);
+  ASSERT_EQ(volume.sizes(), (std::vector<std::int64_t>{64, 64, 64}));
+  const torch::Tensor bright = torch::avg_pool3d(volume.view({1, 1, 64, 64, 64}), {8, 8, 8}).flatten();
+  const torch::Tensor cells = svort::live_frame_cells(options);
+  const torch::Tensor distance = (cells - torch::tensor({10.F, 15.F, 5.F})).norm(2, 1);
+  EXPECT_EQ(bright.argmax().item<std::int64_t>(), distance.argmin().item<std::int64_t>());
+}
+
+TEST(LiveNetwork, CellsThatAgreeOnAMotionMoveTheFrameByIt) {
+  const LiveNetworkOptions options = with_frame_network();
+  const torch::Tensor cells = svort::live_frame_cells(options);
+  const torch::Tensor motion = svort::axisangle_to_matrix(torch::tensor({{0.2F, -0.1F, 0.3F, 4.F, -7.F, 2.F}}));
+  torch::Tensor volume = torch::zeros({1, 1, 64, 64, 64});
+  volume.slice(2, 16, 48).slice(3, 16, 48).slice(4, 16, 48) = 1.;
+  svort::LiveFrameOutput said;
+  said.movement = (svort::transform_points(motion, cells.unsqueeze(0)) - cells) / svort::kLiveUpdateUnitMm;
+  said.log_scale = torch::zeros({1, 512});
+  // What is said where there is no brain does not count, and what is said with doubt hardly.
+  const torch::Tensor brain = svort::brain_in_frame_cells(volume);
+  said.movement += 50. * (brain == 0).unsqueeze(2).to(torch::kFloat32);
+  const std::int64_t doubtful = brain[0].argmax().item<std::int64_t>();
+  said.movement[0][doubtful] += 1.;
+  said.log_scale[0][doubtful] = 5.;
+  EXPECT_TRUE(torch::allclose(svort::frame_motions(said, volume, options), motion, 1e-3, 1e-2));
+  EXPECT_TRUE(torch::allclose(svort::frame_motions(said, torch::zeros_like(volume), options),
+                              torch::eye(4).slice(0, 0, 3).unsqueeze(0)));
+}
+
+TEST(LiveNetwork, TheFrameNetworkCorrectsWhatTheVotesSay) {
+  const torch::NoGradGuard no_grad;
+  const NetworkInput input = lopsided_brain();
+  const auto frame_of = [&](const LiveNetworkOptions& options, bool speaks) {
+    LiveNetwork network(options);
+    randomise(network);
+    // The same first network, whatever else there is.
+    LiveNetwork plain(small());
+    randomise(plain);
+    auto own = network.named_parameters();
+    for (const auto& entry : plain.named_parameters()) own[entry.key()].copy_(entry.value());
+    if (!speaks && options.frame_width > 0) {
+      own["frame_network.out.weight"].zero_();
+      own["frame_network.out.bias"].zero_();
+    }
+    return network.find_frame(network.encode(input.slices, 2.), network.reduce(input.slices, 2.), input);
+  };
+  LiveNetworkOptions options = with_frame_network();
+  const svort::LiveFrame voted = frame_of(small(), true);
+  EXPECT_TRUE(torch::allclose(frame_of(options, false).motion, voted.motion, 1e-4, 1e-3))
+      << "untrained, it says nothing";
+  const svort::LiveFrame corrected = frame_of(options, true);
+  EXPECT_FALSE(torch::allclose(corrected.motion, voted.motion, 1e-2, 1e-1));
+  EXPECT_EQ(corrected.agreement, voted.agreement);
+  options.frame_steps = 0;
+  EXPECT_TRUE(torch::equal(frame_of(options, true).motion, voted.motion));
+  // A step sees the brain where the steps before have brought it.
+  options.frame_steps = 1;
+  const svort::LiveFrame once = frame_of(options, true);
+  EXPECT_FALSE(torch::allclose(once.motion, corrected.motion, 1e-2, 1e-1));
+
+  LiveNetwork without(small());
+  EXPECT_FALSE(without.has_frame_network());
+  EXPECT_THROW(without.look_at_frames(torch::zeros({1, 1, 64, 64, 64})), std::logic_error);
+  LiveNetwork with(with_frame_network());
+  EXPECT_TRUE(with.has_frame_network());
+  EXPECT_THROW(with.look_at_frames(torch::zeros({1, 1, 32, 64, 64})), std::invalid_argument);
+}
+
 TEST(LiveNetwork, AveragesWholePixelsAndRejectsWhatDoesNotFit) {
   LiveNetwork network(small());
   const torch::Tensor fine = torch::rand({2, 1, 128, 128});
@@ -384,6 +503,8 @@ TEST(LiveNetwork, AveragesWholePixelsAndRejectsWhatDoesNotFit) {
   rejects("heads", [](auto& o) { o.heads = 5; });
   rejects("layers", [](auto& o) { o.layers = 0; });
   rejects("iterations", [](auto& o) { o.iterations = 0; });
+  rejects("frame_width", [](auto& o) { o.frame_width = 12; });
+  rejects("frame_steps", [](auto& o) { o.frame_steps = -1; });
 }
 
 }  // namespace

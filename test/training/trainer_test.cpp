@@ -63,6 +63,7 @@ LiveNetworkOptions small_network() {
   options.heads = 2;
   options.layers = 1;
   options.hidden = 24;
+  options.frame_width = 8;
   return options;
 }
 
@@ -153,6 +154,51 @@ TEST_F(TrainerTest, BothNetworksLearnAFixedBatch) {
     }
     EXPECT_LT(after, 0.6 * before) << "first_share " << first_share;
   }
+}
+
+TEST_F(TrainerTest, TheFrameNetworkLearnsAFixedBatch) {
+  torch::manual_seed(7);
+  LiveRecipeOptions options;
+  options.frame_share = 1.;
+  LiveRecipe recipe(std::make_shared<LiveNetwork>(small_network()), options, 1);
+  const auto scans = simulator()->simulate(0, 2);
+  torch::optim::AdamW optimizer(recipe.network().parameters(), torch::optim::AdamWOptions(3e-3));
+  std::map<std::string, double> before, after;
+  for (int i = 0; i <= 40; ++i) {
+    optimizer.zero_grad();
+    StepLoss loss = recipe.loss(scans, 3);
+    loss.total.backward();
+    optimizer.step();
+    after = loss.parts;
+    if (i == 0) before = after;
+  }
+  EXPECT_GT(before.at("frame_start"), 0.1);
+  EXPECT_NEAR(before.at("frame_left"), before.at("frame_start"), 1e-3);  // it begins by leaving frames as they are
+  EXPECT_EQ(after.at("frame_start"), before.at("frame_start"));
+  EXPECT_LT(after.at("frame_cells"), 0.6 * before.at("frame_cells"));
+  EXPECT_LT(after.at("frame_left"), 0.6 * before.at("frame_left"));
+  for (const auto& parameter : recipe.network().named_parameters()) {
+    EXPECT_EQ(parameter.value().grad().defined(), parameter.key().rfind("frame_", 0) == 0) << parameter.key();
+  }
+  // Without a frame network there is nothing to train.
+  LiveNetworkOptions without = small_network();
+  without.frame_width = 0;
+  EXPECT_THROW(LiveRecipe(std::make_shared<LiveNetwork>(without), options, 1), std::invalid_argument);
+}
+
+TEST_F(TrainerTest, FramesThatNothingDisturbsAreRight) {
+  LiveRecipeOptions options;
+  options.frame_share = 1.;
+  options.perturb_deg = options.perturb_mm = options.frame_deg = options.frame_mm = 0.;
+  const auto scans = simulator()->simulate(0, 1);
+  const auto start = [&] {
+    torch::manual_seed(7);
+    LiveRecipe recipe(std::make_shared<LiveNetwork>(small_network()), options, 1);
+    return recipe.loss(scans, 0).parts.at("frame_start");
+  };
+  EXPECT_LT(start(), 1e-4);
+  options.frame_mm = 10.;
+  EXPECT_GT(start(), 1e-2);
 }
 
 TEST_F(TrainerTest, TheBaselinesLearnAFixedBatch) {

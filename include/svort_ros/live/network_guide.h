@@ -51,13 +51,17 @@ class NetworkGuide {
   const EstimatorNotes& notes() const { return notes_; }
 
  private:
-  /// Features of all slices, n x dim; those of slices that have left the sequence are forgotten.
-  torch::Tensor features(const SliceSequence& sequence);
+  struct Encoded {
+    torch::Tensor features;  ///< n x dim
+    torch::Tensor reduced;   ///< n x 1 x p x p, LiveNetwork::reduce()
+  };
+  /// Of all slices; those that have left the sequence are forgotten.
+  Encoded encoded(const SliceSequence& sequence);
 
   std::shared_ptr<LiveNetwork> network_;
   EstimatorNotes notes_;
   /// By slice; holding it keeps its address from being given to another.
-  std::map<std::shared_ptr<const PreparedSlice>, torch::Tensor> encoded_;
+  std::map<std::shared_ptr<const PreparedSlice>, Encoded> encoded_;
   std::size_t count_ = 0;
 };
 

@@ -28,7 +28,9 @@ struct LiveNetworkOptions {
   int iterations = 3;               ///< K: the first network once, then the volume-conditioned network K - 1 times
   bool positional_embedding = true;  ///< false: ablation, tokens carry the image alone
   bool volume_conditioned = true;    ///< false: ablation "w/o Vol", later iterations see the slice alone
-  bool pulls = true;  ///< the shared network is told where registration would take the slices, see LivePulls
+  bool pulls = true;    ///< the shared network is told where registration would take the slices, see LivePulls
+  int frame_width = 0;  ///< channels of the frame network's first stage; 0: there is none, the frame is as voted
+  int frame_steps = 3;  ///< times that the frame network corrects a frame; may be changed after training
   ConsensusOptions consensus;
 
   template <class Visitor>
@@ -45,6 +47,8 @@ struct LiveNetworkOptions {
     v("positional_embedding", positional_embedding, "false: without positional embedding (ablation)");
     v("volume_conditioned", volume_conditioned, "false: later updates do not see the volume (ablation)");
     v("pulls", pulls, "later updates are told where registration would take the slices");
+    v("frame_width", frame_width, "channels of the frame network's first stage; 0: none, the frame is as voted");
+    v("frame_steps", frame_steps, "times that the frame network corrects a frame; may be changed after training");
     v.section("consensus", consensus);
   }
 };
@@ -90,6 +94,32 @@ class LiveTransformerImpl : public torch::nn::Module {
 };
 TORCH_MODULE(LiveTransformer);
 
+/// What the frame network says about each of the c cells that a volume is divided into.
+struct LiveFrameOutput {
+  torch::Tensor movement;   ///< b x c x 3: how the cell has to move, x y z, units of kLiveUpdateUnitMm
+  torch::Tensor log_scale;  ///< b x c: logarithm of the expected error of `movement`, in its unit
+};
+
+/// How a whole brain, whose slices have been placed relative to each other, has to move to lie in the canonical frame:
+/// a residual network over the volume that the slices form. Each cell of the volume says where it belongs, so that a
+/// brain teaches and answers some hundred times.
+class LiveFrameNetworkImpl : public torch::nn::Module {
+ public:
+  explicit LiveFrameNetworkImpl(const LiveNetworkOptions& options);
+  /// b x 1 x d x d x d, d = input_px; `precision` float32 or bfloat16 for the convolutions
+  LiveFrameOutput forward(const torch::Tensor& volumes, torch::ScalarType precision);
+
+ private:
+  struct Block {
+    torch::nn::Conv3d first{nullptr}, second{nullptr}, shortcut{nullptr};
+    torch::nn::GroupNorm first_norm{nullptr}, second_norm{nullptr};
+  };
+  torch::nn::Conv3d stem_{nullptr}, out_{nullptr};
+  torch::nn::GroupNorm stem_norm_{nullptr};
+  std::vector<Block> blocks_;
+};
+TORCH_MODULE(LiveFrameNetwork);
+
 constexpr double kLiveUnitMm = 50.;        ///< unit of the first network's anchor points
 constexpr double kLiveUpdateUnitMm = 10.;  ///< unit of the shared network's movements
 
@@ -125,9 +155,10 @@ struct LivePulls {
 /// prescribed; from these votes follow a head pose (pose_consensus()) and how the head has moved
 /// (trajectory_consensus()). The second, shared by all later iterations, sees each slice beside the slice simulated
 /// from the volume at its current place, hears where images pull it, and moves it: by a mean of the pulls with weights
-/// that it chooses, and a correction of its own; the first network then says again where the whole lies (find_frame()).
-/// Both normalise each slice on its own (group norm), so encode() of a slice never changes; attend() runs over all
-/// slices that are there, 1 to 450 of them, any prefix of a scan.
+/// that it chooses, and a correction of its own; the first network then says again where the whole lies (find_frame()),
+/// and a third network, which sees the volume as a whole, corrects that. Both normalise each slice on its own (group
+/// norm), so encode() of a slice never changes; attend() runs over all slices that are there, 1 to 450 of them, any
+/// prefix of a scan.
 class LiveNetwork : public PoseNetwork {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -161,8 +192,16 @@ class LiveNetwork : public PoseNetwork {
   /// @return n x 3 x 4
   torch::Tensor place(const torch::Tensor& features, const NetworkInput& input,
                       std::vector<torch::Tensor>* attention = nullptr);
-  /// Where slices whose places relative to each other are known, in one frame, lie in the brain's canonical frame.
-  LiveFrame find_frame(const torch::Tensor& features, const NetworkInput& placed);
+  /// Where slices whose places relative to each other are known, in one frame, lie in the brain's canonical frame: as
+  /// the first network votes, then corrected by the frame network, if there is one.
+  /// @param reduced n x 1 x input_px x input_px, reduce()
+  LiveFrame find_frame(const torch::Tensor& features, const torch::Tensor& reduced, const NetworkInput& placed);
+
+  bool has_frame_network() const { return static_cast<bool>(frame_network_); }
+  /// Frame network: how brains that lie near the canonical frame have to move, cell by cell of the volumes they form.
+  /// @param volumes b x 1 x d x d x d, see live_volume()
+  /// @throws std::logic_error if the network has none
+  LiveFrameOutput look_at_frames(const torch::Tensor& volumes);
 
   /// Shared network: one update. `input.transforms` are the current places in the brain frame.
   /// @param simulated n x kLiveSimulatedChannels x input_px x input_px, see simulate_live_channels()
@@ -198,7 +237,24 @@ class LiveNetwork : public PoseNetwork {
   LiveTransformer first_transformer_{nullptr}, shared_transformer_{nullptr};
   torch::nn::Linear first_position_{nullptr}, shared_position_{nullptr}, first_head_{nullptr}, shared_head_{nullptr};
   torch::nn::Linear shared_pulls_{nullptr};
+  LiveFrameNetwork frame_network_{nullptr};
 };
+
+/// Centres of the frame network's cells, c x 3, x y z, mm.
+torch::Tensor live_frame_cells(const LiveNetworkOptions& options);
+/// How much of each cell is brain, b x c, 0 to 1. @param volumes b x 1 x d x d x d
+torch::Tensor brain_in_frame_cells(const torch::Tensor& volumes);
+/// How the whole has to move, from what its cells say: each counts by how much of it is brain and how sure it is.
+/// @param volumes as look_at_frames() saw them
+/// @return b x 3 x 4, on the CPU; the identity for a volume without brain
+torch::Tensor frame_motions(const LiveFrameOutput& said, const torch::Tensor& volumes,
+                            const LiveNetworkOptions& options);
+
+/// PSF reconstruction of the slices at `transforms` on a grid of the network's own resolution. No gradients.
+/// @param reduced n x 1 x p x p, LiveNetwork::reduce()
+/// @return p x p x p
+torch::Tensor live_volume(const torch::Tensor& reduced, const torch::Tensor& transforms,
+                          const LiveNetworkOptions& options, double thickness_mm, AcquisitionFormulation formulation);
 
 /// Channels that the shared network gets beside the slice: the volume seen from the slice's place, and how that changes
 /// along the slice's normal.

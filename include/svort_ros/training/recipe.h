@@ -38,7 +38,8 @@ class TrainingRecipe {
 
 /// How the live network is trained.
 struct LiveRecipeOptions {
-  double first_share = 0.8;          ///< share of steps that train the first network; the others the shared one
+  double frame_share = 0.;           ///< share of steps that train the frame network
+  double first_share = 0.8;          ///< share of the other steps that train the first network; the rest the shared one
   double beta = 0.5;                 ///< where smooth L1 of the first network becomes linear, in its unit (50 mm)
   double shared_beta = 0.1;          ///< the same of the shared network, in its unit (10 mm)
   double mirror_weight = 1.;         ///< of the mirror head's loss
@@ -49,12 +50,15 @@ struct LiveRecipeOptions {
   double perturb_mm = 6.;            ///< displacement of perturbed slices, per axis, at most, mm
   double global_deg = 6.;            ///< rotation of the whole start, per axis, degrees
   double global_mm = 3.;             ///< displacement of the whole start, per axis, mm
+  double frame_deg = 15.;            ///< rotation of brains whose frame is to be corrected, per axis, at most, degrees
+  double frame_mm = 10.;             ///< their displacement, per axis, at most, mm
   double second_update_share = 0.4;  ///< share of steps that make one update without gradient before the one with
   double pulls_unknown_share = 0.1;  ///< share of steps in which the shared network is not told of pulls
 
   template <class Visitor>
   void visit(Visitor&& v) {
-    v("first_share", first_share, "share of steps that train the first network; the others train the shared one");
+    v("frame_share", frame_share, "share of steps that train the frame network");
+    v("first_share", first_share, "share of the other steps that train the first network; the rest the shared one");
     v("beta", beta, "where smooth L1 of the first network becomes linear, in its unit (50 mm)");
     v("shared_beta", shared_beta, "the same of the shared network, in its unit (10 mm)");
     v("mirror_weight", mirror_weight, "weight of the mirror head's loss");
@@ -66,6 +70,8 @@ struct LiveRecipeOptions {
     v("perturb_mm", perturb_mm, "largest displacement of perturbed slices, per axis, mm");
     v("global_deg", global_deg, "rotation of the whole start, standard deviation per axis, degrees");
     v("global_mm", global_mm, "displacement of the whole start, standard deviation per axis, mm");
+    v("frame_deg", frame_deg, "largest standard deviation of the rotation of brains for the frame network, degrees");
+    v("frame_mm", frame_mm, "largest standard deviation of their displacement, per axis, mm");
     v("second_update_share", second_update_share, "share of steps with one update before the one that has a gradient");
     v("pulls_unknown_share", pulls_unknown_share, "share of steps in which the shared network is not told of pulls");
   }
@@ -77,7 +83,8 @@ struct LiveRecipeOptions {
 /// places the slices, as it is now, or from the truth, perturbed, after no or one update without gradient. The volume
 /// is the PSF reconstruction at those places, without gradient. The update is to put slices where they belong among the
 /// others: its target is the truth, moved as one body to where most slices lie, because LiveNetwork::find_frame() says
-/// afterwards where the whole lies.
+/// afterwards where the whole lies. Or it trains the frame network, on volumes of slices near their true places, moved
+/// as one body.
 class LiveRecipe : public TrainingRecipe {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -88,6 +95,7 @@ class LiveRecipe : public TrainingRecipe {
   StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
 
  private:
+  StepLoss frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step);
   torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index);
   StepLoss first_loss(const NetworkInput& input, const torch::Tensor& truth, const torch::Tensor& good,
                       const std::vector<std::int64_t>& lengths);
