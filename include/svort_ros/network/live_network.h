@@ -30,7 +30,7 @@ struct LiveNetworkOptions {
   bool volume_conditioned = true;    ///< false: ablation "w/o Vol", later iterations see the slice alone
   bool pulls = true;    ///< the shared network is told where registration would take the slices, see LivePulls
   int frame_width = 0;  ///< channels of the frame network's first stage; 0: there is none, the frame is as voted
-  int frame_steps = 3;  ///< times that the frame network corrects a frame; may be changed after training
+  int frame_steps = 1;  ///< times that the frame network corrects a frame; may be changed after training
   ConsensusOptions consensus;
 
   template <class Visitor>
