@@ -19,8 +19,8 @@ namespace svort {
 /// Of the network's votes, at least so many must fit one frame for it to be the canonical one.
 constexpr double kFrameAgreement = 0.4;
 
-/// The first part of the live network beside registration: it places slices by what they show, coarsely, but without
-/// losing a head that jumps; and it knows where the brain's canonical frame is.
+/// The live network beside registration, without its shared part: it places slices by what they show, coarsely, but
+/// without losing a head that jumps; and it knows where the brain's canonical frame is.
 ///
 /// A slice is encoded once, when it is first asked about. Runs on the CPU. The same calls give the same answers. Not
 /// thread-safe: one owner.
