@@ -26,7 +26,8 @@ constexpr int kStages = 3;
 constexpr int kCoordinates = 2;
 constexpr int kStemKernel = 6;
 constexpr int kFrameStemKernel = 4;
-constexpr std::int64_t kFrameCell = 8;  // voxels along each side
+constexpr std::int64_t kFrameCell = 8;          // voxels along each side
+constexpr std::size_t kFrameBlocksToCells = 2;  // that halve the sides, after the stem
 
 void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument("LiveNetwork: " + message);
@@ -162,7 +163,7 @@ LiveFrameOutput LiveFrameNetworkImpl::forward(const torch::Tensor& volumes, torc
   torch::Tensor x = torch::relu(normalise(stem_norm_, convolve_3d(stem_, volumes.to(precision))));
   for (std::size_t i = 0; i < blocks_.size(); ++i) {
     const Block& block = blocks_[i];
-    if (i == 2) {
+    if (i == kFrameBlocksToCells) {
       const torch::Tensor axis = torch::linspace(-1., 1., x.size(4), x.options());
       const std::vector<torch::Tensor> zyx = torch::meshgrid({axis, axis, axis}, "ij");
       x = torch::cat({x, torch::stack(zyx).unsqueeze(0).expand({x.size(0), 3, -1, -1, -1})}, 1);

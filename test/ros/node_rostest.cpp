@@ -133,7 +133,15 @@ TEST_F(NodeTest, BadSlicesAreAnsweredWithTheReasonAndLeaveNoTrace) {
       return false;
     });
   };
-  EXPECT_TRUE(reports("svort: slices", "slices rejected"));
+  // On a machine that is busy, being too slow is what the message tells of first: the count is there all the same.
+  EXPECT_TRUE(eventually([&] {
+    for (const auto& array : diagnostics.all())
+      for (const auto& status : array.status)
+        for (const auto& entry : status.values)
+          if (status.name == "svort: slices" && entry.key == "rejected" && std::stoul(entry.value) >= 13U)
+            return status.level == diagnostic_msgs::DiagnosticStatus::WARN;
+    return false;
+  }));
   EXPECT_TRUE(reports("svort: estimator", "poses are nominal"));
   EXPECT_TRUE(reports("svort: results", "written to"));
 }

@@ -12,8 +12,8 @@ namespace svort {
 /// from another file.
 struct JoinedNetwork {
   NetworkInstance network;
-  /// The base's, with the scans of all trainings added up (what they had started from counts once), and `first network`,
-  /// `shared network` and `frame network`, which say where each part comes from.
+  /// The base's, with the scans of all trainings added up (what they had started from counts once), and `first
+  /// network`, `shared network` and `frame network`, which say where each part comes from.
   Provenance provenance;
 };
 
