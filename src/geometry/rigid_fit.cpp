@@ -1,7 +1,6 @@
 #include "svort_ros/geometry/rigid_fit.h"
 
 #include <Eigen/Geometry>
-#include <Eigen/SVD>
 #include <algorithm>
 #include <array>
 #include <stdexcept>
@@ -18,6 +17,13 @@ std::array<Eigen::Vector3d, 3> points_of_plane(double half_field_mm) {
 
 }  // namespace
 
+Pose fit_points(const Eigen::Matrix3Xd& from, const Eigen::Matrix3Xd& to) {
+  if (from.cols() == 0 || from.cols() != to.cols())
+    throw std::invalid_argument("fit_points: " + std::to_string(from.cols()) + " and " + std::to_string(to.cols()) +
+                                " points; there must be as many of both, and one at least");
+  return Pose(Eigen::umeyama(from, to, false));
+}
+
 Pose fit_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm) {
   if (from.empty() || from.size() != to.size())
     throw std::invalid_argument("fit_planes: " + std::to_string(from.size()) + " and " + std::to_string(to.size()) +
@@ -32,7 +38,7 @@ Pose fit_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, doub
       b.col(3 * i + j) = to[k] * corner[static_cast<std::size_t>(j)];
     }
   }
-  return Pose(Eigen::umeyama(a, b, false));
+  return fit_points(a, b);
 }
 
 Pose fit_most_planes(const std::vector<Pose>& from, const std::vector<Pose>& to, double half_field_mm) {
@@ -66,24 +72,6 @@ Pose fit_most_planes(const std::vector<Pose>& from, const std::vector<Pose>& to,
     fit = fit_planes(close_from, close_to, half_field_mm);
   }
   return fit;
-}
-
-Pose fit_points(const Eigen::Matrix3Xd& from, const Eigen::Matrix3Xd& to, const Eigen::VectorXd& weights) {
-  if (from.cols() != to.cols() || from.cols() != weights.size())
-    throw std::invalid_argument("fit_points: " + std::to_string(from.cols()) + " and " + std::to_string(to.cols()) +
-                                " points with " + std::to_string(weights.size()) + " weights");
-  const double sum = weights.sum();
-  if (!(sum > 0.)) return Pose::Identity();
-  const Eigen::Vector3d from_mean = from * weights / sum, to_mean = to * weights / sum;
-  const Eigen::Matrix3d covariance =
-      (to.colwise() - to_mean) * weights.asDiagonal() * (from.colwise() - from_mean).transpose();
-  const Eigen::JacobiSVD<Eigen::Matrix3d> svd(covariance, Eigen::ComputeFullU | Eigen::ComputeFullV);
-  // A rotation, also where a reflection would come closer.
-  const double sign = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0. ? -1. : 1.;
-  Pose motion = Pose::Identity();
-  motion.linear() = svd.matrixU() * Eigen::Vector3d(1., 1., sign).asDiagonal() * svd.matrixV().transpose();
-  motion.translation() = to_mean - motion.linear() * from_mean;
-  return motion;
 }
 
 double plane_distance(const Pose& a, const Pose& b, double half_field_mm) {

@@ -25,9 +25,8 @@ constexpr int kNormGroups = 8;
 constexpr int kStages = 3;
 constexpr int kCoordinates = 2;
 constexpr int kStemKernel = 6;
-constexpr int kFrameStemKernel = 4;
-constexpr std::int64_t kFrameCell = 8;          // voxels along each side
-constexpr std::size_t kFrameBlocksToCells = 2;  // that halve the sides, after the stem
+constexpr std::int64_t kFrameCell = 4;  // pixels: voxels of the perceptron's input
+constexpr float kFramePointMm = 25.F;   // from the middle, along each axis
 
 void require(bool condition, const std::string& message) {
   if (!condition) throw std::invalid_argument("LiveNetwork: " + message);
@@ -46,16 +45,6 @@ torch::Tensor convolve(const nn::Conv2d& module, const torch::Tensor& x) {
   const std::int64_t kernel = module->options.kernel_size()->at(0);
   const std::int64_t padding = kernel == kStemKernel ? 1 : kernel / 2;
   return torch::conv2d(x, module->weight.to(x.scalar_type()), {}, module->options.stride(), padding);
-}
-
-nn::Conv3d convolution_3d(std::int64_t in, std::int64_t out, int kernel, int stride) {
-  return nn::Conv3d(nn::Conv3dOptions(in, out, kernel).stride(stride).bias(false));
-}
-
-torch::Tensor convolve_3d(const nn::Conv3d& module, const torch::Tensor& x) {
-  const std::int64_t kernel = module->options.kernel_size()->at(0);
-  const std::int64_t padding = kernel == kFrameStemKernel ? 1 : kernel / 2;
-  return torch::conv3d(x, module->weight.to(x.scalar_type()), {}, module->options.stride(), padding);
 }
 
 torch::Tensor normalise(const nn::GroupNorm& module, const torch::Tensor& x) {
@@ -134,46 +123,19 @@ torch::Tensor LiveEncoderImpl::forward(const torch::Tensor& images, torch::Scala
 // ---------------------------------------------------------------------------------------------------- frame network
 
 LiveFrameNetworkImpl::LiveFrameNetworkImpl(const LiveNetworkOptions& options) {
-  const std::int64_t width = options.frame_width;
-  stem_ = register_module("stem", convolution_3d(1, width, kFrameStemKernel, 2));
-  stem_norm_ = register_module("stem_norm", group_norm(width));
-  const auto add = [this](std::int64_t in, std::int64_t out, int stride) {
-    const std::string name = "block" + std::to_string(blocks_.size()) + "_";
-    Block block;
-    block.first = register_module(name + "first", convolution_3d(in, out, 3, stride));
-    block.first_norm = register_module(name + "first_norm", group_norm(out));
-    block.second = register_module(name + "second", convolution_3d(out, out, 3, 1));
-    block.second_norm = register_module(name + "second_norm", group_norm(out));
-    nn::init::zeros_(block.second_norm->weight);
-    if (in != out || stride != 1)
-      block.shortcut = register_module(name + "shortcut", convolution_3d(in, out, 1, stride));
-    blocks_.push_back(block);
-  };
-  // Down to the cells, and from there on each cell hears of the others, and of where it is.
-  add(width, 2 * width, 2);
-  add(2 * width, 4 * width, 2);
-  add(4 * width + 3, 4 * width, 1);
-  add(4 * width, 4 * width, 1);
-  out_ = register_module("out", nn::Conv3d(nn::Conv3dOptions(4 * width, 4, 1)));
+  const std::int64_t side = options.input_px / kFrameCell, width = options.frame_width;
+  first_ = register_module("first", nn::Linear(kLiveFrameChannels * side * side * side, width));
+  second_ = register_module("second", nn::Linear(width, width));
+  out_ = register_module("out", nn::Linear(width, 3 * kLiveFramePoints));
   nn::init::zeros_(out_->weight);  // it starts by leaving the frame as it is
   nn::init::zeros_(out_->bias);
 }
 
-LiveFrameOutput LiveFrameNetworkImpl::forward(const torch::Tensor& volumes, torch::ScalarType precision) {
-  torch::Tensor x = torch::relu(normalise(stem_norm_, convolve_3d(stem_, volumes.to(precision))));
-  for (std::size_t i = 0; i < blocks_.size(); ++i) {
-    const Block& block = blocks_[i];
-    if (i == kFrameBlocksToCells) {
-      const torch::Tensor axis = torch::linspace(-1., 1., x.size(4), x.options());
-      const std::vector<torch::Tensor> zyx = torch::meshgrid({axis, axis, axis}, "ij");
-      x = torch::cat({x, torch::stack(zyx).unsqueeze(0).expand({x.size(0), 3, -1, -1, -1})}, 1);
-    }
-    torch::Tensor y = torch::relu(normalise(block.first_norm, convolve_3d(block.first, x)));
-    y = normalise(block.second_norm, convolve_3d(block.second, y));
-    x = torch::relu(y + (block.shortcut ? convolve_3d(block.shortcut, x) : x));
-  }
-  const torch::Tensor said = out_(x.to(torch::kFloat32)).flatten(2);
-  return {said.slice(1, 0, 3).transpose(1, 2), said.select(1, 3)};
+torch::Tensor LiveFrameNetworkImpl::forward(const torch::Tensor& views) {
+  const torch::Tensor seen = torch::avg_pool3d(views, {2, 2, 2}).flatten(1);
+  const torch::Tensor said = out_(torch::relu(second_(torch::relu(first_(seen)))));
+  const torch::Tensor brain = views.select(1, 1).flatten(1).any(1, /*keepdim=*/true).to(torch::kFloat32);
+  return (said * brain).view({-1, kLiveFramePoints, 3});
 }
 
 // ------------------------------------------------------------------------------------------------------ Transformer
@@ -231,9 +193,7 @@ LiveNetwork::LiveNetwork(const LiveNetworkOptions& options) : PoseNetwork("live"
           "dim is " + std::to_string(o.dim) + "; it must be a multiple of heads, which is " + std::to_string(o.heads));
   require(o.layers >= 1 && o.layers <= 48, "layers must be 1 to 48");
   require(o.hidden >= 1 && o.hidden <= 16384, "hidden must be 1 to 16384");
-  require(
-      o.frame_width == 0 || (o.frame_width >= kNormGroups && o.frame_width % kNormGroups == 0 && o.frame_width <= 128),
-      "frame_width is " + std::to_string(o.frame_width) + "; it must be 0 or a multiple of 8 up to 128");
+  require(o.frame_width >= 0 && o.frame_width <= 4096, "frame_width must be 0 to 4096");
   require(o.frame_steps >= 0 && o.frame_steps <= 100, "frame_steps must be 0 to 100");
   require(o.iterations >= 1 && o.iterations <= 100, "iterations must be 1 to 100");
 
@@ -391,13 +351,13 @@ torch::Tensor LiveNetwork::place(const torch::Tensor& features, const NetworkInp
   return compose_transforms(moving.to(input.transforms.device()), input.transforms);
 }
 
-LiveFrameOutput LiveNetwork::look_at_frames(const torch::Tensor& volumes) {
+torch::Tensor LiveNetwork::look_at_frames(const torch::Tensor& views) {
   if (!frame_network_) throw std::logic_error("LiveNetwork: it has no frame network (frame_width is 0)");
-  const std::int64_t p = options_.input_px;
-  require(volumes.defined() && volumes.dim() == 5 && volumes.size(1) == 1 && volumes.size(2) == p &&
-              volumes.size(3) == p && volumes.size(4) == p,
-          "volumes must be b x 1 x d x d x d with d = " + std::to_string(p));
-  return frame_network_->forward(normalised(volumes), precision_);
+  const std::int64_t side = options_.input_px / 2;
+  require(views.defined() && views.dim() == 5 && views.size(1) == kLiveFrameChannels && views.size(2) == side &&
+              views.size(3) == side && views.size(4) == side,
+          "views must be b x 2 x d x d x d with d = " + std::to_string(side));
+  return frame_network_->forward(views);
 }
 
 LiveFrame LiveNetwork::find_frame(const torch::Tensor& features, const torch::Tensor& reduced,
@@ -413,10 +373,9 @@ LiveFrame LiveNetwork::find_frame(const torch::Tensor& features, const torch::Te
   for (int step = 0; step < options_.frame_steps; ++step) {
     const torch::Tensor now =
         compose_transforms(frame.motion.to(device).expand_as(placed.transforms), placed.transforms);
-    const torch::Tensor volume = live_volume(reduced, now, options_, placed.thickness_mm, AcquisitionFormulation::fast)
-                                     .unsqueeze(0)
-                                     .unsqueeze(0);
-    frame.motion = compose_transforms(frame_motions(look_at_frames(volume), volume, options_), frame.motion);
+    const torch::Tensor volume = live_volume(reduced, now, options_, placed.thickness_mm, AcquisitionFormulation::fast);
+    const torch::Tensor view = live_frame_view(volume.unsqueeze(0).unsqueeze(0));
+    frame.motion = compose_transforms(frame_motions(look_at_frames(view)), frame.motion);
   }
   return frame;
 }
@@ -590,36 +549,26 @@ torch::Tensor simulate_live_channels(const torch::Tensor& reduced, const Acquisi
   return look(reduced, geometry, volume, volume.size(0), voxel_mm, formulation);
 }
 
-torch::Tensor live_frame_cells(const LiveNetworkOptions& options) {
-  const std::int64_t cells = options.input_px / kFrameCell;
-  const torch::Tensor axis = (torch::arange(cells, torch::kFloat32) - 0.5 * static_cast<double>(cells - 1)) *
-                             (static_cast<double>(kFrameCell) * options.input_resolution_mm);
-  const std::vector<torch::Tensor> zyx = torch::meshgrid({axis, axis, axis}, "ij");
-  return torch::stack({zyx[2], zyx[1], zyx[0]}, 3).reshape({-1, 3});
+torch::Tensor live_frame_points() {
+  const torch::Tensor axis = torch::tensor({-kFramePointMm, kFramePointMm});
+  return torch::cartesian_prod({axis, axis, axis});
 }
 
-torch::Tensor brain_in_frame_cells(const torch::Tensor& volumes) {
-  const torch::Tensor brain = (volumes.detach() > 0).to(torch::kFloat32);
-  return torch::avg_pool3d(brain, {kFrameCell, kFrameCell, kFrameCell}).flatten(1);
+torch::Tensor live_frame_view(const torch::Tensor& volumes) {
+  const torch::Tensor brain = (volumes > 0).to(torch::kFloat32);
+  return torch::avg_pool3d(torch::cat({normalised(volumes) - brain, brain}, 1), {2, 2, 2});
 }
 
-torch::Tensor frame_motions(const LiveFrameOutput& said, const torch::Tensor& volumes,
-                            const LiveNetworkOptions& options) {
-  const torch::NoGradGuard no_grad;
-  const torch::Tensor cells = live_frame_cells(options);
-  const torch::Tensor targets = cells + said.movement.detach().cpu() * kLiveUpdateUnitMm;
-  const torch::Tensor weights =
-      brain_in_frame_cells(volumes).cpu() * (-2. * said.log_scale.detach().cpu().clamp(-5., 5.)).exp();
-  const auto columns = [](const torch::Tensor& points) {  // c x 3 -> 3 x c
-    const torch::Tensor values = points.to(torch::kFloat64).contiguous();
+torch::Tensor frame_motions(const torch::Tensor& movement) {
+  const torch::Tensor points = live_frame_points();
+  const torch::Tensor targets = points + movement.detach().cpu() * kLiveUpdateUnitMm;
+  const auto columns = [](const torch::Tensor& rows) {  // p x 3 -> 3 x p
+    const torch::Tensor values = rows.to(torch::kFloat64).contiguous();
     return Eigen::Matrix3Xd(Eigen::Map<const Eigen::Matrix3Xd>(values.data_ptr<double>(), 3, values.size(0)));
   };
   std::vector<Pose> motions;
-  for (std::int64_t i = 0; i < volumes.size(0); ++i) {
-    const torch::Tensor weight = weights[i].to(torch::kFloat64).contiguous();
-    motions.push_back(fit_points(columns(cells), columns(targets[i]),
-                                 Eigen::Map<const Eigen::VectorXd>(weight.data_ptr<double>(), weight.size(0))));
-  }
+  for (std::int64_t i = 0; i < movement.size(0); ++i)
+    motions.push_back(fit_points(columns(points), columns(targets[i])));
   return tensor_from_poses(motions);
 }
 

@@ -1,5 +1,6 @@
 #include "svort_ros/training/recipe.h"
 
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 
@@ -19,7 +20,8 @@ enum Purpose : std::uint64_t {
   kWarmStart = 103,
   kPullsUnknown = 104,
   kWhetherFrame = 105,
-  kFrameStart = 106
+  kFrameStart = 106,
+  kFrameBatch = 107
 };
 
 constexpr double kRadians = M_PI / 180.;
@@ -89,6 +91,18 @@ StepLoss sum_of(const std::vector<std::tuple<const char*, double, torch::Tensor>
 
 }  // namespace
 
+void TrainingRecipe::remember(const std::map<std::string, torch::Tensor>& memory) {
+  if (!memory.empty())
+    throw std::runtime_error("holds '" + memory.begin()->first + "', which this recipe does not know");
+}
+
+torch::Tensor moved_as_one(const torch::Tensor& volumes, const torch::Tensor& motions, double half_width) {
+  const torch::Tensor back = trans_first_to_last(inverse_transform(motions));  // where what lies at a place comes from
+  const torch::Tensor theta = torch::cat({back.slice(2, 0, 3), back.slice(2, 3, 4) / half_width}, 2);
+  return torch::grid_sampler(volumes, torch::affine_grid_generator(theta, volumes.sizes(), /*align_corners=*/false),
+                             /*interpolation_mode=*/0, /*padding_mode=*/0, /*align_corners=*/false);
+}
+
 NetworkInput concatenate(const std::vector<const NetworkInput*>& inputs) {
   if (inputs.empty()) throw std::invalid_argument("concatenate: there is no input");
   const auto joined = [&inputs](torch::Tensor NetworkInput::*member) {
@@ -118,6 +132,8 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
           "0, because network.frame_width is 0: there is no frame network");
   require(size(options.frame_deg) && options.frame_deg <= 180., "frame_deg", "0 to 180 degrees");
   require(size(options.frame_mm), "frame_mm", "zero or positive");
+  require(options.frame_bank >= 1 && options.frame_bank <= 1000000, "frame_bank", "1 to 1000000");
+  require(options.frame_batch >= 1 && options.frame_batch <= 65536, "frame_batch", "1 to 65536");
   require(share(options.first_share), "first_share", "0 to 1");
   require(share(options.placed_share), "placed_share", "0 to 1");
   require(share(options.second_update_share), "second_update_share", "0 to 1");
@@ -134,8 +150,8 @@ LiveRecipe::LiveRecipe(std::shared_ptr<LiveNetwork> network, const LiveRecipeOpt
 }
 
 std::vector<std::string> LiveRecipe::parts() const {
-  return {"first_points",   "first_mirrored", "first_scale", "first_quality", "shared_points", "shared_scale",
-          "shared_quality", "shared_start",   "frame_cells", "frame_scale",   "frame_start",   "frame_left"};
+  return {"first_points",   "first_mirrored", "first_scale",  "first_quality", "shared_points", "shared_scale",
+          "shared_quality", "shared_start",   "frame_points", "frame_start",   "frame_left"};
 }
 
 StepLoss LiveRecipe::loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
@@ -238,48 +254,88 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   return loss;
 }
 
-StepLoss LiveRecipe::frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
-  // A scan is costly to make and a second frame is not.
-  constexpr std::uint64_t kFramesPerScan = 2;
+void LiveRecipe::put_into_bank(const SimulatedScan& scan, RandomStream& random) {
   const LiveNetworkOptions& shape = network_->options();
   const AnchorFrame frame = live_anchor_frame(shape);
-  const torch::Tensor cells = live_frame_cells(shape);
-  std::vector<torch::Tensor> volumes, targets;
+  const torch::Tensor truth = scan.truth.cpu();
+  // Most disturbances are small: the frame is looked for when the slices have been registered.
+  const double size = std::pow(random.uniform(), 2);
+  const torch::Tensor placed =
+      perturbed(truth, random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
+  const torch::Tensor volume = live_volume(network_->reduce(scan.input.slices, scan.input.slice_resolution_mm), placed,
+                                           shape, scan.input.thickness_mm, AcquisitionFormulation::fast);
+  // Where the best frame would leave it: what is wrong among the slices is none of the frame's business.
+  const Pose best =
+      fit_most_planes(poses_from_tensor(placed), poses_from_tensor(truth), 0.5 * frame.width * frame.resolution);
+  if (!bank_views_.defined()) {
+    const std::int64_t rows = options_.frame_bank, side = shape.input_px / 2;
+    bank_views_ = torch::zeros({rows, kLiveFrameChannels, side, side, side}, volume.options().dtype(torch::kHalf));
+    bank_frames_ = torch::zeros({rows, 3, 4});
+  }
+  const std::int64_t row = banked_ % options_.frame_bank;
+  bank_views_[row] = live_frame_view(volume.unsqueeze(0).unsqueeze(0))[0];
+  bank_frames_[row] = tensor_from_pose(best)[0];
+  ++banked_;
+}
+
+std::map<std::string, torch::Tensor> LiveRecipe::memory() const {
+  if (banked_ == 0) return {};
+  const std::int64_t rows = std::min<std::int64_t>(banked_, options_.frame_bank);
+  return {{"bank_views", bank_views_.slice(0, 0, rows)},
+          {"bank_frames", bank_frames_.slice(0, 0, rows)},
+          {"banked", torch::tensor({banked_}, torch::kInt64)}};
+}
+
+void LiveRecipe::remember(const std::map<std::string, torch::Tensor>& memory) {
+  if (memory.empty()) return;
+  const std::int64_t side = network_->options().input_px / 2, banked = memory.at("banked").item<std::int64_t>();
+  const std::int64_t rows = std::min<std::int64_t>(banked, options_.frame_bank);
+  const torch::Tensor views = memory.at("bank_views"), frames = memory.at("bank_frames");
+  if (views.sizes() != std::vector<std::int64_t>{rows, kLiveFrameChannels, side, side, side} || frames.size(0) != rows)
+    throw std::runtime_error("holds a bank of " + std::to_string(views.size(0)) +
+                             " volumes that does not fit recipe.frame_bank " + std::to_string(options_.frame_bank) +
+                             " and network.input_px " + std::to_string(network_->options().input_px));
+  bank_views_ = torch::zeros({options_.frame_bank, kLiveFrameChannels, side, side, side}, views.options());
+  bank_frames_ = torch::zeros({options_.frame_bank, 3, 4});
+  bank_views_.slice(0, 0, rows).copy_(views);
+  bank_frames_.slice(0, 0, rows).copy_(frames);
+  banked_ = banked;
+}
+
+StepLoss LiveRecipe::frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
+  constexpr std::uint64_t kVolumesPerScan = 2;
   for (std::size_t i = 0; i < scans.size(); ++i) {
-    const torch::Tensor truth = scans[i].truth.cpu();
-    const torch::Tensor reduced = network_->reduce(scans[i].input.slices, scans[i].input.slice_resolution_mm);
-    for (std::uint64_t k = 0; k < kFramesPerScan; ++k) {
-      RandomStream random(seed_, (step * 64 + i) * kFramesPerScan + k, kFrameStart);
-      // Most are small: this is how frames are voted, and what is left of them after a step.
-      const double size = std::pow(random.uniform(), 2), off = std::pow(random.uniform(), 2);
-      const torch::Tensor placed =
-          perturbed(truth, random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
-      const torch::Tensor motion = axisangle_to_matrix(
-          random_motion(random, off * options_.frame_deg * kRadians, off * options_.frame_mm).unsqueeze(0));
-      const torch::Tensor moved = compose_transforms(motion.expand_as(placed), placed);
-      volumes.push_back(live_volume(reduced, moved, shape, scans[i].input.thickness_mm, AcquisitionFormulation::fast));
-      // Where the best frame would leave it: what is wrong among the slices is none of the frame's business.
-      const Pose best =
-          fit_most_planes(poses_from_tensor(moved), poses_from_tensor(truth), 0.5 * frame.width * frame.resolution);
-      targets.push_back(transform_points(tensor_from_pose(best), cells.unsqueeze(0)).squeeze(0) - cells);
+    for (std::uint64_t k = 0; k < kVolumesPerScan; ++k) {
+      RandomStream random(seed_, (step * 1024 + i) * kVolumesPerScan + k, kFrameStart);
+      put_into_bank(scans[i], random);
     }
   }
-  const torch::Tensor seen = torch::stack(volumes).unsqueeze(1).to(scans.front().truth.device());
-  const LiveFrameOutput said = network_->look_at_frames(seen);
-  const torch::Tensor target = (torch::stack(targets) / kLiveUpdateUnitMm).to(seen.device());
-  const torch::Tensor brain = brain_in_frame_cells(seen);
-  const torch::Tensor share = brain / brain.mean().clamp_min(1e-6);
-  const auto rows = [](const torch::Tensor& points) { return points.reshape({-1, 3}); };
-  const torch::Tensor points = smooth_l1_loss(rows(said.movement), rows(target), options_.shared_beta);
-  const torch::Tensor error = (said.movement - target).detach().norm(2, 2);
-  StepLoss loss = sum_of({{"frame_cells", 1., points * share.flatten()},
-                          {"frame_scale", options_.scale_weight, scale_loss(error, said.log_scale) * share}});
-  // Mean distance of brain from where it belongs, in the same unit: as found, and after what the cells say together.
-  const torch::Tensor moved =
-      (transform_points(frame_motions(said, seen, shape), cells.expand({seen.size(0), -1, 3})) - cells) /
-      kLiveUpdateUnitMm;
-  loss.parts["frame_start"] = (target.norm(2, 2) * share).mean().item<double>();
-  loss.parts["frame_left"] = ((target - moved.to(seen.device())).norm(2, 2) * share).mean().item<double>();
+  const LiveNetworkOptions& shape = network_->options();
+  const std::int64_t banked = std::min<std::int64_t>(banked_, options_.frame_bank);
+  RandomStream random(seed_, step, kFrameBatch);
+  std::vector<std::int64_t> drawn;
+  std::vector<torch::Tensor> moves;
+  for (int k = 0; k < options_.frame_batch; ++k) {
+    drawn.push_back(std::min(banked - 1, static_cast<std::int64_t>(random.uniform() * static_cast<double>(banked))));
+    // Most are small: this is how frames are voted, and what is left of them after a step.
+    const double off = std::pow(random.uniform(), 2);
+    moves.push_back(random_motion(random, off * options_.frame_deg * kRadians, off * options_.frame_mm));
+  }
+  const torch::Tensor motions = axisangle_to_matrix(torch::stack(moves)), index = torch::tensor(drawn);
+  const torch::Device device = bank_views_.device();
+  const torch::Tensor seen = moved_as_one(bank_views_.index_select(0, index.to(device)).to(torch::kFloat32),
+                                          motions.to(device), 0.5 * shape.input_px * shape.input_resolution_mm);
+  const torch::Tensor points = live_frame_points().expand({options_.frame_batch, -1, -1});
+  const torch::Tensor back = compose_transforms(bank_frames_.index_select(0, index), inverse_transform(motions));
+  const torch::Tensor target = (transform_points(back, points) - points) / kLiveUpdateUnitMm;
+  const torch::Tensor said = network_->look_at_frames(seen);
+  const auto rows = [](const torch::Tensor& values) { return values.reshape({-1, 3}); };
+  StepLoss loss =
+      sum_of({{"frame_points", 1., smooth_l1_loss(rows(said), rows(target.to(seen.device())), options_.shared_beta)}});
+  // Mean distance of the points from where they belong, in the same unit: as found, and after what they say together.
+  const torch::Tensor moved = (transform_points(frame_motions(said), points) - points) / kLiveUpdateUnitMm;
+  loss.parts["frame_start"] = target.norm(2, 2).mean().item<double>();
+  loss.parts["frame_left"] = (target - moved).norm(2, 2).mean().item<double>();
   return loss;
 }
 

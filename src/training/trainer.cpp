@@ -249,6 +249,9 @@ void Trainer::save() const {
       "counters",
       torch::tensor({progress_.step, progress_.scans, progress_.skipped, options_.seed, first_scan_}, torch::kInt64));
   archive.write("seconds", torch::tensor({progress_.seconds}, torch::kFloat64));
+  torch::serialize::OutputArchive memory;
+  for (const auto& [name, value] : recipe_->memory()) memory.write(name, value);
+  archive.write("memory", memory);
   archive.save_to(temporary.string());
   std::filesystem::rename(temporary, path);
 }
@@ -276,6 +279,12 @@ void Trainer::resume() {
     progress_.skipped = counters[2].item<std::int64_t>();
     first_scan_ = counters[4].item<std::int64_t>();
     progress_.seconds = seconds[0].item<double>();
+    torch::serialize::InputArchive memory;
+    std::map<std::string, torch::Tensor> remembered;
+    if (archive.try_read("memory", memory)) {
+      for (const std::string& name : memory.keys()) memory.read(name, remembered[name]);
+    }
+    recipe_->remember(remembered);
   } catch (const c10::Error& error) {
     throw std::runtime_error(path.string() + ": is not the state of this network: " + error.what_without_backtrace());
   } catch (const std::runtime_error& error) {

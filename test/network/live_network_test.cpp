@@ -103,7 +103,7 @@ constexpr double kRounding = 2e-5;
 
 TEST(LiveNetwork, DefaultsAreWithinTheLimitsOnSize) {
   LiveNetworkOptions options;
-  options.frame_width = 16;
+  options.frame_width = 256;
   const LiveNetwork network(options);
   std::int64_t count = 0;
   for (const torch::Tensor& parameter : network.parameters()) count += parameter.numel();
@@ -388,55 +388,49 @@ LiveNetworkOptions with_frame_network() {
   return options;
 }
 
-TEST(LiveNetwork, CellsOfTheFrameNetworkTileTheVolume) {
-  const LiveNetworkOptions options = with_frame_network();
-  const torch::Tensor cells = svort::live_frame_cells(options);
-  ASSERT_EQ(cells.sizes(), (std::vector<std::int64_t>{512, 3}));
-  EXPECT_LT(cells.mean(0).abs().max().item<float>(), 1e-4F);
-  // x runs fastest: cells of 8 voxels of 2 mm.
-  EXPECT_TRUE(torch::allclose(cells[0], torch::tensor({-56.F, -56.F, -56.F})));
-  EXPECT_TRUE(torch::allclose(cells[1] - cells[0], torch::tensor({16.F, 0.F, 0.F})));
-  EXPECT_TRUE(torch::allclose(cells[64] - cells[0], torch::tensor({0.F, 0.F, 16.F})));
-  // A volume whose brightest voxel is known shows which cell is where.
-  torch::Tensor volume = torch::zeros({1, 1, 64, 64, 64});
-  volume.slice(2, 8, 16).slice(3, 0, 8).slice(4, 16, 20) = 1.;
-  const torch::Tensor brain = svort::brain_in_frame_cells(volume)[0];
-  EXPECT_EQ(brain.argmax().item<std::int64_t>(), 64 + 2);
-  EXPECT_FLOAT_EQ(brain.max().item<float>(), 0.5F);
-  EXPECT_FLOAT_EQ(brain.sum().item<float>(), 0.5F);
-}
-
-TEST(LiveNetwork, AVolumesVoxelsLieWhereItsCellsSay) {
-  // The blob is in the cell that is closest to it.
+TEST(LiveNetwork, AVolumesVoxelsLieWhereItsSlicesDo) {
   const NetworkInput input = lopsided_brain();
-  const LiveNetworkOptions options = with_frame_network();
   const torch::Tensor volume =
-      svort::live_volume(input.slices, input.transforms, options, 3., svort::AcquisitionFormulation::fast);
+      svort::live_volume(input.slices, input.transforms, with_frame_network(), 3., svort::AcquisitionFormulation::fast);
   ASSERT_EQ(volume.sizes(), (std::vector<std::int64_t>{64, 64, 64}));
-  const torch::Tensor bright = torch::avg_pool3d(volume.view({1, 1, 64, 64, 64}), {8, 8, 8}).flatten();
-  const torch::Tensor cells = svort::live_frame_cells(options);
-  const torch::Tensor distance = (cells - torch::tensor({10.F, 15.F, 5.F})).norm(2, 1);
-  EXPECT_EQ(bright.argmax().item<std::int64_t>(), distance.argmin().item<std::int64_t>());
+  // The bright ball, weighted by how much brighter than brain it is; voxels of 2 mm, the middle in the middle.
+  const torch::Tensor bright = (volume - 1.2).clamp_min(0.);
+  const torch::Tensor axis = (torch::arange(64, torch::kFloat32) - 31.5) * 2.;
+  const auto middle = [&](std::int64_t keep) {
+    std::vector<std::int64_t> others;
+    for (std::int64_t k = 0; k < 3; ++k)
+      if (k != keep) others.push_back(k);
+    return ((bright.sum(others) * axis).sum() / bright.sum()).item<float>();
+  };
+  EXPECT_NEAR(middle(2), 10., 1.);
+  EXPECT_NEAR(middle(1), 15., 1.);
+  EXPECT_NEAR(middle(0), 5., 1.);
 }
 
-TEST(LiveNetwork, CellsThatAgreeOnAMotionMoveTheFrameByIt) {
-  const LiveNetworkOptions options = with_frame_network();
-  const torch::Tensor cells = svort::live_frame_cells(options);
-  const torch::Tensor motion = svort::axisangle_to_matrix(torch::tensor({{0.2F, -0.1F, 0.3F, 4.F, -7.F, 2.F}}));
-  torch::Tensor volume = torch::zeros({1, 1, 64, 64, 64});
-  volume.slice(2, 16, 48).slice(3, 16, 48).slice(4, 16, 48) = 1.;
-  svort::LiveFrameOutput said;
-  said.movement = (svort::transform_points(motion, cells.unsqueeze(0)) - cells) / svort::kLiveUpdateUnitMm;
-  said.log_scale = torch::zeros({1, 512});
-  // What is said where there is no brain does not count, and what is said with doubt hardly.
-  const torch::Tensor brain = svort::brain_in_frame_cells(volume);
-  said.movement += 50. * (brain == 0).unsqueeze(2).to(torch::kFloat32);
-  const std::int64_t doubtful = brain[0].argmax().item<std::int64_t>();
-  said.movement[0][doubtful] += 1.;
-  said.log_scale[0][doubtful] = 5.;
-  EXPECT_TRUE(torch::allclose(svort::frame_motions(said, volume, options), motion, 1e-3, 1e-2));
-  EXPECT_TRUE(torch::allclose(svort::frame_motions(said, torch::zeros_like(volume), options),
-                              torch::eye(4).slice(0, 0, 3).unsqueeze(0)));
+TEST(LiveNetwork, TheFrameNetworkSeesBrightnessAgainstTheMeanAndWhereBrainIs) {
+  torch::Tensor volumes = torch::zeros({2, 1, 64, 64, 64});
+  volumes[0][0].slice(0, 16, 48).slice(1, 16, 48).slice(2, 16, 47) = 3.;
+  volumes[0][0].slice(0, 16, 48).slice(1, 16, 32).slice(2, 16, 47) = 1.;
+  const torch::Tensor view = svort::live_frame_view(volumes);
+  ASSERT_EQ(view.sizes(), (std::vector<std::int64_t>{2, 2, 32, 32, 32}));
+  EXPECT_FLOAT_EQ(view[0][0][16][20][16].item<float>(), 0.5F);   // 3 where the mean is 2
+  EXPECT_FLOAT_EQ(view[0][0][16][10][16].item<float>(), -0.5F);  // 1
+  EXPECT_FLOAT_EQ(view[0][0][16][20][23].item<float>(), 0.25F);  // half brain, half none
+  EXPECT_FLOAT_EQ(view[0][1][16][20][23].item<float>(), 0.5F);
+  EXPECT_FLOAT_EQ(view[0][1][16][20][24].item<float>(), 0.F);
+  EXPECT_TRUE(torch::allclose(svort::live_frame_view(7. * volumes), view)) << "whatever the scanner's unit";
+  EXPECT_EQ(view[1].abs().max().item<float>(), 0.F) << "nothing, without brain";
+}
+
+TEST(LiveNetwork, PointsThatAgreeOnAMotionMoveTheFrameByIt) {
+  const torch::Tensor points = svort::live_frame_points();
+  ASSERT_EQ(points.sizes(), (std::vector<std::int64_t>{svort::kLiveFramePoints, 3}));
+  EXPECT_EQ(points.mean(0).abs().max().item<float>(), 0.F);
+  const torch::Tensor motions =
+      svort::axisangle_to_matrix(torch::tensor({{0.2F, -0.1F, 0.3F, 4.F, -7.F, 2.F}, {0.F, 0.F, 0.F, 0.F, 0.F, 0.F}}));
+  const torch::Tensor movement =
+      (svort::transform_points(motions, points.expand({2, -1, -1})) - points) / svort::kLiveUpdateUnitMm;
+  EXPECT_TRUE(torch::allclose(svort::frame_motions(movement), motions, 1e-3, 1e-3));
 }
 
 TEST(LiveNetwork, TheFrameNetworkCorrectsWhatTheVotesSay) {
@@ -473,10 +467,16 @@ TEST(LiveNetwork, TheFrameNetworkCorrectsWhatTheVotesSay) {
 
   LiveNetwork without(small());
   EXPECT_FALSE(without.has_frame_network());
-  EXPECT_THROW(without.look_at_frames(torch::zeros({1, 1, 64, 64, 64})), std::logic_error);
+  EXPECT_THROW(without.look_at_frames(torch::zeros({1, 2, 32, 32, 32})), std::logic_error);
   LiveNetwork with(with_frame_network());
   EXPECT_TRUE(with.has_frame_network());
-  EXPECT_THROW(with.look_at_frames(torch::zeros({1, 1, 32, 64, 64})), std::invalid_argument);
+  EXPECT_THROW(with.look_at_frames(torch::zeros({1, 2, 32, 32, 64})), std::invalid_argument);
+  EXPECT_THROW(with.look_at_frames(torch::zeros({1, 1, 32, 32, 32})), std::invalid_argument);
+  randomise(with);
+  const torch::Tensor said =
+      with.look_at_frames(torch::stack({torch::zeros({2, 32, 32, 32}), torch::rand({2, 32, 32, 32})}));
+  EXPECT_EQ(said[0].abs().max().item<float>(), 0.F) << "of a volume without brain it says nothing";
+  EXPECT_GT(said[1].abs().max().item<float>(), 0.F);
 }
 
 TEST(LiveNetwork, AveragesWholePixelsAndRejectsWhatDoesNotFit) {
@@ -504,7 +504,7 @@ TEST(LiveNetwork, AveragesWholePixelsAndRejectsWhatDoesNotFit) {
   rejects("heads", [](auto& o) { o.heads = 5; });
   rejects("layers", [](auto& o) { o.layers = 0; });
   rejects("iterations", [](auto& o) { o.iterations = 0; });
-  rejects("frame_width", [](auto& o) { o.frame_width = 12; });
+  rejects("frame_width", [](auto& o) { o.frame_width = -1; });
   rejects("frame_steps", [](auto& o) { o.frame_steps = -1; });
 }
 

@@ -63,7 +63,7 @@ LiveNetworkOptions small_network() {
   options.heads = 2;
   options.layers = 1;
   options.hidden = 24;
-  options.frame_width = 8;
+  options.frame_width = 32;
   return options;
 }
 
@@ -97,10 +97,12 @@ class TrainerTest : public ::testing::Test {
   }
   void TearDown() override { std::filesystem::remove_all(folder_); }
 
-  static std::shared_ptr<LiveRecipe> recipe(double first_share = 0.5) {
+  static std::shared_ptr<LiveRecipe> recipe(double first_share = 0.5, double frame_share = 0., int frame_bank = 2048) {
     torch::manual_seed(7);
     LiveRecipeOptions options;
     options.first_share = first_share;
+    options.frame_share = frame_share;
+    options.frame_bank = frame_bank;
     return std::make_shared<LiveRecipe>(std::make_shared<LiveNetwork>(small_network()), options, 1);
   }
   std::vector<std::string> lines(const char* file) const {
@@ -122,20 +124,41 @@ bool same_weights(const Trainer& a, const Trainer& b) {
 }
 
 TEST_F(TrainerTest, AResumedRunEndsWhereAnUninterruptedOneDoes) {
-  Trainer whole(recipe(), {simulator()}, nullptr, quick(), folder_ / "whole");
-  for (int i = 0; i < 6; ++i) whole.step();
-  TrainerOptions ahead = quick();
-  ahead.prefetch = true;
-  Trainer first(recipe(), {simulator()}, nullptr, ahead, folder_ / "parts");
-  for (int i = 0; i < 3; ++i) first.step();
-  EXPECT_FALSE(same_weights(first, whole));
-  first.save();
-  Trainer second(recipe(), {simulator()}, nullptr, quick(), folder_ / "parts");
-  second.resume();
-  EXPECT_EQ(second.progress().step, 3);
-  EXPECT_EQ(second.progress().scans, 6);
-  for (int i = 0; i < 3; ++i) second.step();
-  EXPECT_TRUE(same_weights(second, whole));
+  // The frame network draws from the volumes of earlier scans: from all of them, or from the last.
+  for (const auto& [frame_share, frame_bank] : {std::pair(0., 2048), std::pair(1., 2048), std::pair(1., 10)}) {
+    SCOPED_TRACE("frame_share " + std::to_string(frame_share) + ", frame_bank " + std::to_string(frame_bank));
+    const auto make = [share = frame_share, bank = frame_bank] { return recipe(0.5, share, bank); };
+    const std::filesystem::path folder = folder_ / (std::to_string(frame_share) + "_" + std::to_string(frame_bank));
+    Trainer whole(make(), {simulator()}, nullptr, quick(), folder / "whole");
+    for (int i = 0; i < 6; ++i) whole.step();
+    TrainerOptions ahead = quick();
+    ahead.prefetch = true;
+    Trainer first(make(), {simulator()}, nullptr, ahead, folder / "parts");
+    for (int i = 0; i < 3; ++i) first.step();
+    EXPECT_FALSE(same_weights(first, whole));
+    first.save();
+    Trainer second(make(), {simulator()}, nullptr, quick(), folder / "parts");
+    second.resume();
+    EXPECT_EQ(second.progress().step, 3);
+    EXPECT_EQ(second.progress().scans, 6);
+    for (int i = 0; i < 3; ++i) second.step();
+    EXPECT_TRUE(same_weights(second, whole));
+  }
+}
+
+TEST_F(TrainerTest, ABankOfVolumesThatDoesNotFitIsRefused) {
+  Trainer trainer(recipe(0.5, 1., 10), {simulator()}, nullptr, quick(), folder_);
+  for (int i = 0; i < 3; ++i) trainer.step();
+  trainer.save();
+  Trainer wider(recipe(0.5, 1., 11), {simulator()}, nullptr, quick(), folder_);
+  try {
+    wider.resume();
+    FAIL() << "resumed with another bank";
+  } catch (const std::runtime_error& error) {
+    EXPECT_NE(std::string(error.what()).find("recipe.frame_bank 11"), std::string::npos) << error.what();
+  }
+  AnchorRecipe knows_no_bank(std::make_shared<PlaneInVol>(BaselineOptions()));
+  EXPECT_THROW(knows_no_bank.remember({{"banked", torch::zeros({1})}}), std::runtime_error);
 }
 
 TEST_F(TrainerTest, BothNetworksLearnAFixedBatch) {
@@ -160,6 +183,7 @@ TEST_F(TrainerTest, TheFrameNetworkLearnsAFixedBatch) {
   torch::manual_seed(7);
   LiveRecipeOptions options;
   options.frame_share = 1.;
+  options.frame_bank = 4;  // the two volumes of each scan, put there anew every time
   LiveRecipe recipe(std::make_shared<LiveNetwork>(small_network()), options, 1);
   const auto scans = simulator()->simulate(0, 2);
   torch::optim::AdamW optimizer(recipe.network().parameters(), torch::optim::AdamWOptions(3e-3));
@@ -175,7 +199,7 @@ TEST_F(TrainerTest, TheFrameNetworkLearnsAFixedBatch) {
   EXPECT_GT(before.at("frame_start"), 0.1);
   EXPECT_NEAR(before.at("frame_left"), before.at("frame_start"), 1e-3);  // it begins by leaving frames as they are
   EXPECT_EQ(after.at("frame_start"), before.at("frame_start"));
-  EXPECT_LT(after.at("frame_cells"), 0.6 * before.at("frame_cells"));
+  EXPECT_LT(after.at("frame_points"), 0.6 * before.at("frame_points"));
   EXPECT_LT(after.at("frame_left"), 0.6 * before.at("frame_left"));
   for (const auto& parameter : recipe.network().named_parameters()) {
     EXPECT_EQ(parameter.value().grad().defined(), parameter.key().rfind("frame_", 0) == 0) << parameter.key();
@@ -184,6 +208,31 @@ TEST_F(TrainerTest, TheFrameNetworkLearnsAFixedBatch) {
   LiveNetworkOptions without = small_network();
   without.frame_width = 0;
   EXPECT_THROW(LiveRecipe(std::make_shared<LiveNetwork>(without), options, 1), std::invalid_argument);
+}
+
+TEST_F(TrainerTest, AVolumeMovedAsOneIsTheVolumeOfSlicesThatMoved) {
+  const SimulatedScan scan = simulator()->simulate(0, 1).front();
+  LiveNetwork network(small_network());
+  const torch::Tensor slices = network.reduce(scan.input.slices, scan.input.slice_resolution_mm);
+  const auto view = [&](const torch::Tensor& poses) {
+    return live_frame_view(
+        live_volume(slices, poses, network.options(), scan.input.thickness_mm, AcquisitionFormulation::fast)
+            .unsqueeze(0)
+            .unsqueeze(0));
+  };
+  const torch::Tensor motions =
+      axisangle_to_matrix(torch::tensor({{0.3F, -0.1F, 0.2F, 4.F, -7.F, 2.F}, {-0.1F, 0.2F, 0.1F, 0.F, 3.F, -8.F}}));
+  const double half_width = 0.5 * network.options().input_px * network.options().input_resolution_mm;
+  const torch::Tensor still = view(scan.truth),
+                      moved = moved_as_one(still.expand({2, -1, -1, -1, -1}), motions, half_width);
+  ASSERT_EQ(moved.size(0), 2);
+  for (std::int64_t m = 0; m < 2; ++m) {
+    const torch::Tensor exact =
+        view(compose_transforms(motions.slice(0, m, m + 1).expand_as(scan.truth), scan.truth))[0];
+    const double off = (moved[m] - exact).norm().item<double>();
+    EXPECT_LT(off, 0.3 * (still[0] - exact).norm().item<double>()) << m;
+    EXPECT_LT(off, 0.3 * exact.norm().item<double>()) << m;
+  }
 }
 
 TEST_F(TrainerTest, FramesThatNothingDisturbsAreRight) {

@@ -29,7 +29,7 @@ struct LiveNetworkOptions {
   bool positional_embedding = true;  ///< false: ablation, tokens carry the image alone
   bool volume_conditioned = true;    ///< false: ablation "w/o Vol", later iterations see the slice alone
   bool pulls = true;    ///< the shared network is told where registration would take the slices, see LivePulls
-  int frame_width = 0;  ///< channels of the frame network's first stage; 0: there is none, the frame is as voted
+  int frame_width = 0;  ///< units in each hidden layer of the frame network; 0: there is none, the frame is as voted
   int frame_steps = 1;  ///< times that the frame network corrects a frame; may be changed after training
   ConsensusOptions consensus;
 
@@ -47,7 +47,7 @@ struct LiveNetworkOptions {
     v("positional_embedding", positional_embedding, "false: without positional embedding (ablation)");
     v("volume_conditioned", volume_conditioned, "false: later updates do not see the volume (ablation)");
     v("pulls", pulls, "later updates are told where registration would take the slices");
-    v("frame_width", frame_width, "channels of the frame network's first stage; 0: none, the frame is as voted");
+    v("frame_width", frame_width, "units in a hidden layer of the frame network; 0: none, the frame is as voted");
     v("frame_steps", frame_steps, "times that the frame network corrects a frame; may be changed after training");
     v.section("consensus", consensus);
   }
@@ -94,29 +94,24 @@ class LiveTransformerImpl : public torch::nn::Module {
 };
 TORCH_MODULE(LiveTransformer);
 
-/// What the frame network says about each of the c cells that a volume is divided into.
-struct LiveFrameOutput {
-  torch::Tensor movement;   ///< b x c x 3: how the cell has to move, x y z, units of kLiveUpdateUnitMm
-  torch::Tensor log_scale;  ///< b x c: logarithm of the expected error of `movement`, in its unit
-};
+/// Channels of a volume as the frame network sees it, see live_frame_view().
+constexpr int kLiveFrameChannels = 2;
+/// Points of the head whose movements say how the whole moves, see live_frame_points().
+constexpr int kLiveFramePoints = 8;
 
 /// How a whole brain, whose slices have been placed relative to each other, has to move to lie in the canonical frame:
-/// a residual network over the volume that the slices form. Each cell of the volume says where it belongs, so that a
-/// brain teaches and answers some hundred times.
+/// a perceptron over the volume that the slices form. The brain lies near that frame already, so each of its weights
+/// stands for a place in the head. Convolutions, which have to find out where they are first, learned to shift brains
+/// but, from as many scans, not to turn them.
 class LiveFrameNetworkImpl : public torch::nn::Module {
  public:
   explicit LiveFrameNetworkImpl(const LiveNetworkOptions& options);
-  /// b x 1 x d x d x d, d = input_px; `precision` float32 or bfloat16 for the convolutions
-  LiveFrameOutput forward(const torch::Tensor& volumes, torch::ScalarType precision);
+  /// @param views b x kLiveFrameChannels x d/2 x d/2 x d/2, d = input_px
+  /// @return b x kLiveFramePoints x 3: how each point has to move, x y z, units of kLiveUpdateUnitMm; 0 without brain
+  torch::Tensor forward(const torch::Tensor& views);
 
  private:
-  struct Block {
-    torch::nn::Conv3d first{nullptr}, second{nullptr}, shortcut{nullptr};
-    torch::nn::GroupNorm first_norm{nullptr}, second_norm{nullptr};
-  };
-  torch::nn::Conv3d stem_{nullptr}, out_{nullptr};
-  torch::nn::GroupNorm stem_norm_{nullptr};
-  std::vector<Block> blocks_;
+  torch::nn::Linear first_{nullptr}, second_{nullptr}, out_{nullptr};
 };
 TORCH_MODULE(LiveFrameNetwork);
 
@@ -198,10 +193,11 @@ class LiveNetwork : public PoseNetwork {
   LiveFrame find_frame(const torch::Tensor& features, const torch::Tensor& reduced, const NetworkInput& placed);
 
   bool has_frame_network() const { return static_cast<bool>(frame_network_); }
-  /// Frame network: how brains that lie near the canonical frame have to move, cell by cell of the volumes they form.
-  /// @param volumes b x 1 x d x d x d, see live_volume()
+  /// Frame network: how brains that lie near the canonical frame have to move to lie in it, see frame_motions().
+  /// @param views b x kLiveFrameChannels x d/2 x d/2 x d/2, d = input_px, see live_frame_view()
+  /// @return b x kLiveFramePoints x 3, units of kLiveUpdateUnitMm
   /// @throws std::logic_error if the network has none
-  LiveFrameOutput look_at_frames(const torch::Tensor& volumes);
+  torch::Tensor look_at_frames(const torch::Tensor& views);
 
   /// Shared network: one update. `input.transforms` are the current places in the brain frame.
   /// @param simulated n x kLiveSimulatedChannels x input_px x input_px, see simulate_live_channels()
@@ -240,15 +236,18 @@ class LiveNetwork : public PoseNetwork {
   LiveFrameNetwork frame_network_{nullptr};
 };
 
-/// Centres of the frame network's cells, c x 3, x y z, mm.
-torch::Tensor live_frame_cells(const LiveNetworkOptions& options);
-/// How much of each cell is brain, b x c, 0 to 1. @param volumes b x 1 x d x d x d
-torch::Tensor brain_in_frame_cells(const torch::Tensor& volumes);
-/// How the whole has to move, from what its cells say: each counts by how much of it is brain and how sure it is.
-/// @param volumes as look_at_frames() saw them
-/// @return b x 3 x 4, on the CPU; the identity for a volume without brain
-torch::Tensor frame_motions(const LiveFrameOutput& said, const torch::Tensor& volumes,
-                            const LiveNetworkOptions& options);
+/// The points whose movements the frame network estimates, kLiveFramePoints x 3, x y z, mm: corners of a cube in the
+/// head.
+torch::Tensor live_frame_points();
+/// Volumes as the frame network sees them, in voxels of twice their size: how much brighter than the mean of the brain,
+/// times how much of the voxel is brain; and how much of it is.
+/// @param volumes b x 1 x d x d x d, see live_volume(); 0 where there is no brain
+/// @return b x kLiveFrameChannels x d/2 x d/2 x d/2
+torch::Tensor live_frame_view(const torch::Tensor& volumes);
+/// The rigid motions that fit what is said of the points best.
+/// @param movement b x kLiveFramePoints x 3, LiveNetwork::look_at_frames()
+/// @return b x 3 x 4, on the CPU
+torch::Tensor frame_motions(const torch::Tensor& movement);
 
 /// PSF reconstruction of the slices at `transforms` on a grid of the network's own resolution. No gradients.
 /// @param reduced n x 1 x p x p, LiveNetwork::reduce()

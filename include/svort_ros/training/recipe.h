@@ -12,6 +12,7 @@
 #include "svort_ros/network/live_network.h"
 #include "svort_ros/network/pose_network.h"
 #include "svort_ros/network/svort.h"
+#include "svort_ros/simulation/random_stream.h"
 #include "svort_ros/simulation/scan_simulator.h"
 
 namespace svort {
@@ -30,10 +31,15 @@ class TrainingRecipe {
   /// Names of all parts that loss() may report, in the order of the log's columns.
   virtual std::vector<std::string> parts() const = 0;
   /// @param scans at least one, none without slices
-  /// @param step  number of the step: what is random in the recipe depends on it and the seed alone
+  /// @param step  number of the step: what is random in the recipe depends on it and the seed alone; the loss also on
+  ///              the network and on memory()
   virtual StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) = 0;
   /// How many scans of a step loss() takes at once: gradients of the others are added up. 0: all.
   virtual std::size_t scans_at_once() const { return 0; }
+  /// What the recipe carries from step to step beside the network, by name: part of the trainer's state.
+  virtual std::map<std::string, torch::Tensor> memory() const { return {}; }
+  /// Takes back what memory() gave. @throws std::runtime_error naming what does not fit
+  virtual void remember(const std::map<std::string, torch::Tensor>& memory);
 };
 
 /// How the live network is trained.
@@ -52,6 +58,8 @@ struct LiveRecipeOptions {
   double global_mm = 3.;             ///< displacement of the whole start, per axis, mm
   double frame_deg = 15.;            ///< rotation of brains whose frame is to be corrected, per axis, at most, degrees
   double frame_mm = 10.;             ///< their displacement, per axis, at most, mm
+  int frame_bank = 2048;             ///< volumes that the frame network's training draws from; 0.13 MB each
+  int frame_batch = 32;              ///< volumes of a step of the frame network
   double second_update_share = 0.4;  ///< share of steps that make one update without gradient before the one with
   double pulls_unknown_share = 0.1;  ///< share of steps in which the shared network is not told of pulls
 
@@ -72,10 +80,19 @@ struct LiveRecipeOptions {
     v("global_mm", global_mm, "displacement of the whole start, standard deviation per axis, mm");
     v("frame_deg", frame_deg, "largest standard deviation of the rotation of brains for the frame network, degrees");
     v("frame_mm", frame_mm, "largest standard deviation of their displacement, per axis, mm");
+    v("frame_bank", frame_bank, "volumes that the frame network's training draws from: those of the latest scans");
+    v("frame_batch", frame_batch, "volumes of a step of the frame network");
     v("second_update_share", second_update_share, "share of steps with one update before the one that has a gradient");
     v("pulls_unknown_share", pulls_unknown_share, "share of steps in which the shared network is not told of pulls");
   }
 };
+
+/// What is in volumes, each moved as one body, as far as it stays within the volume's field.
+/// @param volumes    b x c x d x d x d
+/// @param motions    b x 3 x 4, trans_first, mm, about the middle of the volume
+/// @param half_width of a volume, mm
+/// @return b x c x d x d x d, interpolated linearly
+torch::Tensor moved_as_one(const torch::Tensor& volumes, const torch::Tensor& motions, double half_width);
 
 /// Live recipe: smooth L1 on anchor points, a mirror head that may be wrong by a reflection, and warm starts.
 ///
@@ -84,7 +101,8 @@ struct LiveRecipeOptions {
 /// is the PSF reconstruction at those places, without gradient. The update is to put slices where they belong among the
 /// others: its target is the truth, moved as one body to where most slices lie, because LiveNetwork::find_frame() says
 /// afterwards where the whole lies. Or it trains the frame network, on volumes of slices near their true places, moved
-/// as one body.
+/// as one body: a bank of volumes of the latest scans is kept, and every step draws from it, because volumes of one or
+/// two brains are no batch to learn turns from, and a brain costs far more to simulate than to move.
 class LiveRecipe : public TrainingRecipe {
  public:
   /// @throws std::invalid_argument naming the option that is out of range
@@ -93,8 +111,11 @@ class LiveRecipe : public TrainingRecipe {
   PoseNetwork& network() override { return *network_; }
   std::vector<std::string> parts() const override;
   StepLoss loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) override;
+  std::map<std::string, torch::Tensor> memory() const override;
+  void remember(const std::map<std::string, torch::Tensor>& memory) override;
 
  private:
+  void put_into_bank(const SimulatedScan& scan, RandomStream& random);
   StepLoss frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step);
   torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index);
   StepLoss first_loss(const NetworkInput& input, const torch::Tensor& truth, const torch::Tensor& good,
@@ -105,6 +126,9 @@ class LiveRecipe : public TrainingRecipe {
   std::shared_ptr<LiveNetwork> network_;
   LiveRecipeOptions options_;
   std::uint64_t seed_;
+  torch::Tensor bank_views_;   // up to frame_bank x kLiveFrameChannels x d x d x d, half, see live_frame_view()
+  torch::Tensor bank_frames_;  // as many x 3 x 4, CPU: the motion that brings that volume's brain to where it belongs
+  std::int64_t banked_ = 0;    // volumes so far; the next one's row is that modulo frame_bank
 };
 
 /// The paper's recipe for its baselines: squared distance of the anchor points.
