@@ -86,8 +86,9 @@ struct ValidationResult {
 
 /// Trains one network on simulated scans, and can be stopped and resumed at any step.
 ///
-/// In `folder` it keeps state.pt (weights, optimiser, average, counters), training.csv (losses) and validation.csv.
-/// Scan numbers and random choices follow from the step number, so a resumed run continues as if it had not stopped.
+/// In `folder` it keeps state.pt (weights, optimiser, average, counters, the recipe's memory), training.csv (losses)
+/// and validation.csv. Scan numbers and random choices follow from the step number, so a resumed run continues as if it
+/// had not stopped.
 class Trainer {
  public:
   /// @param recipe     its network is on the device that it is to be trained on
