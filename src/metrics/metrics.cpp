@@ -9,6 +9,7 @@
 #include <string>
 #include <vector>
 
+#include "svort_ros/geometry/rigid_fit.h"
 #include "svort_ros/geometry/rigid_transform.h"
 #include "svort_ros/metrics/image_similarity.h"
 #include "svort_ros/metrics/pose_error.h"
@@ -117,7 +118,7 @@ Pose global_alignment(const torch::Tensor& estimated, const torch::Tensor& truth
     const torch::Tensor points = anchor_points_from_matrix(poses, frame).view({-1, 3}).contiguous();
     return Eigen::Matrix3Xd(Eigen::Map<const Eigen::Matrix3Xd>(points.data_ptr<double>(), 3, points.size(0)));
   };
-  return Pose(Eigen::umeyama(points_of(a), points_of(b), false));
+  return fit_points(points_of(a), points_of(b));
 }
 
 torch::Tensor transformed_poses(const Pose& transform, const torch::Tensor& poses) {

@@ -25,6 +25,11 @@ enum Purpose : std::uint64_t {
 };
 
 constexpr double kRadians = M_PI / 180.;
+constexpr std::uint64_t kVolumesPerScan = 2;  // of the frame network's bank
+// The bank in the trainer's state.
+constexpr const char* kBankViews = "bank_views";
+constexpr const char* kBankFrames = "bank_frames";
+constexpr const char* kBanked = "banked";
 
 void require(bool condition, const char* option, const char* range) {
   if (!condition) throw std::invalid_argument(std::string("recipe.") + option + " must be " + range);
@@ -254,69 +259,70 @@ StepLoss LiveRecipe::shared_loss(const std::vector<SimulatedScan>& scans, Networ
   return loss;
 }
 
-void LiveRecipe::put_into_bank(const SimulatedScan& scan, RandomStream& random) {
+std::int64_t LiveRecipe::bank_rows() const { return std::min<std::int64_t>(banked_, options_.frame_bank); }
+
+void LiveRecipe::make_bank(const torch::Device& device) {
+  const std::int64_t rows = options_.frame_bank, side = network_->options().input_px / 2;
+  bank_views_ = torch::zeros({rows, kLiveFrameChannels, side, side, side}, torch::device(device).dtype(torch::kHalf));
+  bank_frames_ = torch::zeros({rows, 3, 4});
+}
+
+void LiveRecipe::put_into_bank(const SimulatedScan& scan, std::uint64_t first) {
   const LiveNetworkOptions& shape = network_->options();
   const AnchorFrame frame = live_anchor_frame(shape);
   const torch::Tensor truth = scan.truth.cpu();
-  // Most disturbances are small: the frame is looked for when the slices have been registered.
-  const double size = std::pow(random.uniform(), 2);
-  const torch::Tensor placed =
-      perturbed(truth, random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
-  const torch::Tensor volume = live_volume(network_->reduce(scan.input.slices, scan.input.slice_resolution_mm), placed,
-                                           shape, scan.input.thickness_mm, AcquisitionFormulation::fast);
-  // Where the best frame would leave it: what is wrong among the slices is none of the frame's business.
-  const Pose best =
-      fit_most_planes(poses_from_tensor(placed), poses_from_tensor(truth), 0.5 * frame.width * frame.resolution);
-  if (!bank_views_.defined()) {
-    const std::int64_t rows = options_.frame_bank, side = shape.input_px / 2;
-    bank_views_ = torch::zeros({rows, kLiveFrameChannels, side, side, side}, volume.options().dtype(torch::kHalf));
-    bank_frames_ = torch::zeros({rows, 3, 4});
+  const torch::Tensor reduced = network_->reduce(scan.input.slices, scan.input.slice_resolution_mm);
+  if (!bank_views_.defined()) make_bank(reduced.device());
+  for (std::uint64_t k = 0; k < kVolumesPerScan; ++k) {
+    RandomStream random(seed_, first + k, kFrameStart);
+    // Most disturbances are small: the frame is looked for when the slices have been registered.
+    const double size = std::pow(random.uniform(), 2);
+    const torch::Tensor placed =
+        perturbed(truth, random, size * options_.perturb_deg * kRadians, size * options_.perturb_mm);
+    const torch::Tensor volume =
+        live_volume(reduced, placed, shape, scan.input.thickness_mm, AcquisitionFormulation::fast);
+    // Where the best frame would leave it: what is wrong among the slices is none of the frame's business.
+    const Pose best =
+        fit_most_planes(poses_from_tensor(placed), poses_from_tensor(truth), 0.5 * frame.width * frame.resolution);
+    const std::int64_t row = banked_ % options_.frame_bank;
+    bank_views_[row] = live_frame_view(volume.unsqueeze(0).unsqueeze(0))[0];
+    bank_frames_[row] = tensor_from_pose(best)[0];
+    ++banked_;
   }
-  const std::int64_t row = banked_ % options_.frame_bank;
-  bank_views_[row] = live_frame_view(volume.unsqueeze(0).unsqueeze(0))[0];
-  bank_frames_[row] = tensor_from_pose(best)[0];
-  ++banked_;
 }
 
 std::map<std::string, torch::Tensor> LiveRecipe::memory() const {
   if (banked_ == 0) return {};
-  const std::int64_t rows = std::min<std::int64_t>(banked_, options_.frame_bank);
-  return {{"bank_views", bank_views_.slice(0, 0, rows)},
-          {"bank_frames", bank_frames_.slice(0, 0, rows)},
-          {"banked", torch::tensor({banked_}, torch::kInt64)}};
+  return {{kBankViews, bank_views_.slice(0, 0, bank_rows())},
+          {kBankFrames, bank_frames_.slice(0, 0, bank_rows())},
+          {kBanked, torch::tensor({banked_}, torch::kInt64)}};
 }
 
 void LiveRecipe::remember(const std::map<std::string, torch::Tensor>& memory) {
   if (memory.empty()) return;
-  const std::int64_t side = network_->options().input_px / 2, banked = memory.at("banked").item<std::int64_t>();
-  const std::int64_t rows = std::min<std::int64_t>(banked, options_.frame_bank);
-  const torch::Tensor views = memory.at("bank_views"), frames = memory.at("bank_frames");
-  if (views.sizes() != std::vector<std::int64_t>{rows, kLiveFrameChannels, side, side, side} || frames.size(0) != rows)
+  for (const char* name : {kBankViews, kBankFrames, kBanked})
+    if (memory.count(name) == 0)
+      throw std::runtime_error(std::string("holds a bank of volumes without '") + name + "'");
+  const torch::Tensor views = memory.at(kBankViews), frames = memory.at(kBankFrames);
+  banked_ = memory.at(kBanked).item<std::int64_t>();
+  make_bank(views.device());
+  torch::Tensor bank_views = bank_views_.slice(0, 0, bank_rows()), bank_frames = bank_frames_.slice(0, 0, bank_rows());
+  if (views.sizes() != bank_views.sizes() || frames.sizes() != bank_frames.sizes())
     throw std::runtime_error("holds a bank of " + std::to_string(views.size(0)) +
                              " volumes that does not fit recipe.frame_bank " + std::to_string(options_.frame_bank) +
                              " and network.input_px " + std::to_string(network_->options().input_px));
-  bank_views_ = torch::zeros({options_.frame_bank, kLiveFrameChannels, side, side, side}, views.options());
-  bank_frames_ = torch::zeros({options_.frame_bank, 3, 4});
-  bank_views_.slice(0, 0, rows).copy_(views);
-  bank_frames_.slice(0, 0, rows).copy_(frames);
-  banked_ = banked;
+  bank_views.copy_(views);
+  bank_frames.copy_(frames);
 }
 
 StepLoss LiveRecipe::frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step) {
-  constexpr std::uint64_t kVolumesPerScan = 2;
-  for (std::size_t i = 0; i < scans.size(); ++i) {
-    for (std::uint64_t k = 0; k < kVolumesPerScan; ++k) {
-      RandomStream random(seed_, (step * 1024 + i) * kVolumesPerScan + k, kFrameStart);
-      put_into_bank(scans[i], random);
-    }
-  }
+  for (std::size_t i = 0; i < scans.size(); ++i) put_into_bank(scans[i], (step * 1024 + i) * kVolumesPerScan);
   const LiveNetworkOptions& shape = network_->options();
-  const std::int64_t banked = std::min<std::int64_t>(banked_, options_.frame_bank);
   RandomStream random(seed_, step, kFrameBatch);
   std::vector<std::int64_t> drawn;
   std::vector<torch::Tensor> moves;
   for (int k = 0; k < options_.frame_batch; ++k) {
-    drawn.push_back(std::min(banked - 1, static_cast<std::int64_t>(random.uniform() * static_cast<double>(banked))));
+    drawn.push_back(random.integer(0, static_cast<int>(bank_rows()) - 1));
     // Most are small: this is how frames are voted, and what is left of them after a step.
     const double off = std::pow(random.uniform(), 2);
     moves.push_back(random_motion(random, off * options_.frame_deg * kRadians, off * options_.frame_mm));

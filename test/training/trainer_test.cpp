@@ -157,6 +157,7 @@ TEST_F(TrainerTest, ABankOfVolumesThatDoesNotFitIsRefused) {
   } catch (const std::runtime_error& error) {
     EXPECT_NE(std::string(error.what()).find("recipe.frame_bank 11"), std::string::npos) << error.what();
   }
+  EXPECT_THROW(recipe(0.5, 1., 10)->remember({{"banked", torch::zeros({1})}}), std::runtime_error);  // without volumes
   AnchorRecipe knows_no_bank(std::make_shared<PlaneInVol>(BaselineOptions()));
   EXPECT_THROW(knows_no_bank.remember({{"banked", torch::zeros({1})}}), std::runtime_error);
 }

@@ -12,7 +12,6 @@
 #include "svort_ros/network/live_network.h"
 #include "svort_ros/network/pose_network.h"
 #include "svort_ros/network/svort.h"
-#include "svort_ros/simulation/random_stream.h"
 #include "svort_ros/simulation/scan_simulator.h"
 
 namespace svort {
@@ -115,7 +114,10 @@ class LiveRecipe : public TrainingRecipe {
   void remember(const std::map<std::string, torch::Tensor>& memory) override;
 
  private:
-  void put_into_bank(const SimulatedScan& scan, RandomStream& random);
+  std::int64_t bank_rows() const;
+  void make_bank(const torch::Device& device);
+  /// @param first number of the first of the scan's volumes: what is random in them depends on it and the seed
+  void put_into_bank(const SimulatedScan& scan, std::uint64_t first);
   StepLoss frame_loss(const std::vector<SimulatedScan>& scans, std::uint64_t step);
   torch::Tensor warm_start(const SimulatedScan& scan, std::uint64_t step, std::uint64_t index);
   StepLoss first_loss(const NetworkInput& input, const torch::Tensor& truth, const torch::Tensor& good,
